@@ -1,0 +1,318 @@
+"""Quality against time by the Poisson disk radius at test time (paper, TimingPD).
+
+    python -m benchmarks.poisson_radii --run runs/ao_train
+
+One set of weights, one object after the other, radii in turns. Capacities are measured
+for each radius, so that no radius pays for another's.
+"""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks import require, start
+from benchmarks.timing import describe, load, measure
+from ginn_jax import architecture, report, scenes
+from ginn_jax.architecture import Network
+from ginn_jax.dataset import ShadedPoints
+from ginn_jax.errors import InputError
+from ginn_jax.evaluate import View, image_errors, reference_view
+from ginn_jax.geometry import (
+    Demands,
+    Limits,
+    build_geometry,
+    build_query_field,
+    limit_names,
+    measure_limits,
+    uniform_limits,
+)
+from ginn_jax.image import (
+    BLOCK,
+    as_openness,
+    encode_cloud,
+    shade_image,
+    shade_points,
+    with_disk_radius,
+)
+from ginn_jax.mcconv import Oriented
+from ginn_jax.mesh import Samples, find_meshes, sample_surface
+from ginn_jax.metrics import mse
+from ginn_jax.neighbors import bucket, pad_rows
+from ginn_jax.network import Variables
+from ginn_jax.train import Training, init_state
+
+UNSEEN_SEED = 20_000_000
+ASKED = 4096
+SLACK = 1.1
+KEY = jax.random.key
+# The paper's table TimingPD, AO rows: object, radius -> thousands of points, ms.
+PAPER = {
+    ("Elephant", 0.01): (8.6, 203.6),
+    ("Elephant", 0.015): (4.1, 66.1),
+    ("Elephant", 0.02): (2.3, 34.6),
+    ("Horse", 0.01): (3.5, 35.7),
+    ("Horse", 0.015): (1.7, 20.5),
+    ("Horse", 0.02): (0.9, 15.9),
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Time and error of a trained network at several Poisson disk radii."""
+
+    out: Path = Path("runs/poisson_radii")
+    """Folder for metrics.json, report.md and the figure."""
+    run: Path | None = None
+    """Folder of a finished ao_train with the weights; without one they are untrained:
+    times hold, errors do not."""
+    meshes: Path | None = None
+    """A mesh file or a folder of meshes; without it procedural shapes."""
+    shapes: int = 2
+    """Procedural shapes, of seeds that training does not use."""
+    radii: tuple[float, ...] = (0.01, 0.015, 0.02, 0.03)
+    """Poisson disk radii, in units of the object's longest side."""
+    points: int = 20_000
+    """Samples of an object before the disk; few of them starve the small radii."""
+    resolution: int = 512
+    """Side of the image in pixels."""
+    rays: int = 1024
+    """Rays of the reference, per point and per pixel."""
+    occlusion: float | None = None
+    """Occlusion radius; without it that of the run, or 0.1."""
+    repeats: int = 7
+    """Timed calls of each radius."""
+    quick: bool = False
+    """Two radii, a small image, few rays: to try things, not for numbers."""
+
+
+QUICK = {"radii": (0.02, 0.03), "points": 4000, "resolution": 96, "rays": 32}
+QUICK |= {"repeats": 2}
+
+
+class Model(NamedTuple):
+    """A network and its weights, and the occlusion radius that it learned."""
+
+    network: Network
+    variables: Variables
+    occlusion: float
+
+
+class Subject(NamedTuple):
+    """An object: what the network is given, and references at points and at pixels."""
+
+    name: str
+    given: Samples
+    asked: ShadedPoints
+    view: View
+
+
+def load_model(folder: Path | None) -> Model:
+    """The weights of a finished run, or untrained ones of the default network."""
+    if folder is None:
+        network = architecture.DEFAULT
+        config = Training(network, steps=1, batch_size=1, points=64, queries=64)
+        blank = ShadedPoints(*(np.zeros((1, 64, *s), np.float32) for s in _SHAPES))
+        state = init_state(config, uniform_limits(network, 64), blank)
+        return Model(network, state.variables, scenes.Occlusion.radius)
+    from ginn_jax.checkpoint import load_weights
+
+    network, _, variables = load_weights(folder)
+    record = json.loads((folder / "run.json").read_text())
+    return Model(network, variables, record["occlusion"]["radius"])
+
+
+_SHAPES = ((3,), (3,), (), ())
+
+
+def make_subject(source: scenes.Source, options: Options, radius: float) -> Subject:
+    """Sample and ray-trace an object; the points asked are others than those given."""
+    mesh = scenes.load_object(source)
+    given = sample_surface(mesh, options.points, seed=source.seed)
+    settings = scenes.Occlusion(ASKED, options.rays, radius)
+    asked = scenes.occlusion_cloud(mesh, settings, source.seed + 1)
+    view = reference_view(mesh, radius, options.rays, source.seed, options.resolution)
+    return Subject(source.name, given, asked, view)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _demands(
+    network: Network, limits: Limits, cloud: Oriented, blocks: Oriented
+) -> Demands:
+    """What f_3D and every block of f_2D need."""
+    geometry, demands = build_geometry(network, limits, cloud, key=KEY(0))
+    ends = geometry.levels[0], geometry.grid, geometry.area
+    needs = jax.lax.map(
+        lambda block: build_query_field(network, limits, *ends, block)[1], blocks
+    )
+    return demands | jax.tree.map(lambda need: jnp.max(need), needs)
+
+
+def tight_limits(network: Network, subject: Subject) -> Limits:
+    """Capacities with little to spare for this cloud and these pixels."""
+    given, gbuffer = subject.given, subject.view.gbuffer
+    cloud = _padded(given.position, given.normal, bucket(len(given.position)))
+    pixels = gbuffer.position[gbuffer.mask], gbuffer.normal[gbuffer.mask]
+    flat = _padded(*pixels, -(-len(pixels[0]) // BLOCK) * BLOCK)
+    blocks = jax.tree.map(lambda a: a.reshape(-1, BLOCK, *a.shape[1:]), flat)
+    names = limit_names(network)
+    rows = [1 << (15 if name.endswith("points") else 20) for name in names]
+    generous = Limits(tuple(zip(names, rows, strict=True)))
+
+    def probe(limits: Limits, _: int) -> Demands:
+        return _demands(network, limits, cloud, blocks)
+
+    return measure_limits(generous, probe, 1, SLACK)
+
+
+def _padded(position: np.ndarray, normal: np.ndarray, rows: int) -> Oriented:
+    points, mask = pad_rows(position, rows)
+    return Oriented(points, pad_rows(normal, rows)[0], mask)
+
+
+def evaluate(model: Model, subject: Subject, radius: float) -> tuple[dict, dict]:
+    """Errors at one radius, and the two calls to be timed."""
+    network = with_disk_radius(model.network, radius)
+    limits = tight_limits(network, subject)
+    given, asked, gbuffer = subject.given, subject.asked, subject.view.gbuffer
+    arrays = given.position, given.normal
+
+    def encode() -> Any:
+        return encode_cloud(network, limits, model.variables, *arrays, key=KEY(0))
+
+    encoded, used = encode()
+    pixels = gbuffer.position, gbuffer.normal, gbuffer.mask
+    shaded = partial(shade_image, network, limits, model.variables, encoded, *pixels)
+    image, used_2d = shaded()
+    assert used == used_2d == limits, "a capacity that was measured did not suffice"
+    ends = asked.position, asked.normal
+    values, _ = shade_points(network, limits, model.variables, encoded, *ends)
+    noise = float(np.mean(asked.variance))
+    row = {"object": subject.name, "radius": radius}
+    row |= {"points": int(np.sum(encoded.points.mask)), "pixels": int(pixels[2].sum())}
+    row |= {"mse_3d": mse(as_openness(values), asked.target) - noise}
+    row |= image_errors(subject.view, image)
+    row |= {"noise_floor_3d": noise, "limits": dict(limits.sizes)}
+    return row, {"f_3D": encode, "f_2D": shaded}
+
+
+def compare(model: Model, subject: Subject, options: Options) -> list[dict[str, Any]]:
+    """One row for each radius of an object, timed in turns."""
+    rows, calls = [], dict[tuple[str, float], Callable[[], Any]]()
+    for radius in options.radii:
+        begin = time.perf_counter()
+        row, parts = evaluate(model, subject, radius)
+        row["seconds_compile"] = time.perf_counter() - begin
+        rows.append(row)
+        calls |= {(part, radius): call for part, call in parts.items()}
+    names = {f"{part} {radius}": call for (part, radius), call in calls.items()}
+    timings = measure(names, options.repeats)
+    for row in rows:
+        for part in ("f_3D", "f_2D"):
+            timing = timings[f"{part} {row['radius']}"]
+            row |= {f"ms_{part}": 1e3 * timing.median, part: timing.record()}
+    return rows
+
+
+def main(options: Options) -> dict[str, Any]:
+    """Compare radii on every object; returns what metrics.json holds."""
+    require(options, {"shapes": 1, "points": 1000, "resolution": 32, "rays": 2})
+    require(options, {"repeats": 1})
+    if not options.radii:
+        raise InputError("--radii is empty: give at least one")
+    begin = time.perf_counter()
+    model = load_model(options.run)
+    variables = jax.device_put(model.variables, jax.devices()[0])
+    occlusion = options.occlusion or model.occlusion
+    model = model._replace(variables=variables, occlusion=occlusion)
+    for radius in options.radii:
+        with_disk_radius(model.network, radius)  # for its checks
+    sources = scenes.procedural_sources(options.shapes, UNSEEN_SEED)
+    if options.meshes is not None:
+        sources = scenes.file_sources(find_meshes(options.meshes))
+    subjects = (make_subject(s, options, model.occlusion) for s in sources)
+    rows = [row for subject in subjects for row in compare(model, subject, options)]
+    metrics = {
+        "rows": rows,
+        "trained": options.run is not None,
+        "occlusion_radius": model.occlusion,
+        "network": asdict(model.network),
+        "paper": [[*where, *what] for where, what in PAPER.items()],
+        "options": asdict(options),
+        "environment": report.environment() | {"load": load()},
+        "seconds_compile": sum(row["seconds_compile"] for row in rows),
+        "seconds_total": time.perf_counter() - begin,
+    }
+    text = write_report(metrics)
+    report.write_results(options.out, metrics, text)
+    draw(options.out / "poisson_radii.png", rows)
+    print(text)
+    return metrics
+
+
+def write_report(metrics: dict[str, Any]) -> str:
+    """report.md: our table beside the paper's."""
+    columns = {"object": "object", "radius": "radius", "points": "points"}
+    columns |= {"ms_f_3D": "f_3D ms", "ms_f_2D": "f_2D ms", "pixels": "pixels"}
+    columns |= {"mse_3d": "3D MSE", "mse_2d": "2D MSE", "dssim_2d": "DSSIM"}
+    ours = report.table_of(metrics["rows"], columns)
+    heads = ["object", "radius", "points (k)", "ms"]
+    paper, options = report.markdown_table(heads, metrics["paper"]), metrics["options"]
+    network = metrics["network"]
+    weights = f"Weights of {options['run']}."
+    if not metrics["trained"]:
+        weights = "**Weights are untrained: times hold, errors mean nothing.**"
+    return f"""# Poisson disk radius at test time, ambient occlusion
+
+{weights} Levels {network["levels"]} but for the finest, f_2D radius
+{network["query"]["radius"]}, occlusion radius {metrics["occlusion_radius"]};
+{options["points"]} samples of an object before the disk, {options["resolution"]} x
+{options["resolution"]} image of which the foreground pixels are shaded. Times: median
+of {options["repeats"]} calls, compilation apart, G-buffer not counted. Errors: against
+Mitsuba at {options["rays"]} rays, whose noise is subtracted from the MSE; DSSIM after
+the paper's tone mapping, over the foreground.
+{describe()}
+
+{ours}
+The paper's table TimingPD (AO, whole network at 1024 x 1024, GTX 1080), on its objects:
+
+{paper}
+![time and error against radius](poisson_radii.png)
+"""
+
+
+def draw(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Time and error against the radius, a line for each object and quantity."""
+    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    names = dict.fromkeys(row["object"] for row in rows)
+    panels = {
+        "ms": ("ms_f_3D", "ms_f_2D"),
+        "MSE": ("mse_3d", "mse_2d"),
+        "DSSIM": ("dssim_2d",),
+    }
+    grid = figure.subplots(1, 3)
+    for axes, (unit, keys) in zip(grid, panels.items(), strict=True):
+        for i, name in enumerate(names):
+            own = [row for row in rows if row["object"] == name]
+            for key, style in zip(keys, ("-o", "--s"), strict=False):
+                radii, values = [r["radius"] for r in own], [r[key] for r in own]
+                axes.plot(radii, values, style, color=f"C{i}", label=f"{name} {key}")
+        axes.set(xlabel="Poisson disk radius", ylabel=unit, ylim=(0, None))
+        axes.legend(fontsize=6)
+    for name in ("Elephant", "Horse"):
+        points = [(r, ms) for (who, r), (_, ms) in PAPER.items() if who == name]
+        grid[0].plot(*zip(*points, strict=True), ":^", color="gray", label=name)
+        grid[0].annotate(f"paper, {name}, GTX 1080", points[0], fontsize=6)
+    figure.savefig(path, dpi=130)
+
+
+if __name__ == "__main__":
+    start(Options, main, QUICK)

@@ -1,0 +1,83 @@
+"""How long things take: compilation apart, variants alternated in one process."""
+
+import os
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from ginn_jax.report import environment
+
+Variants = Mapping[str, Callable[[], Any]]
+
+
+class Timing(NamedTuple):
+    """Wall seconds of one variant: its first call, which compiles, and the others."""
+
+    first: float
+    seconds: tuple[float, ...]
+
+    @property
+    def median(self) -> float:
+        """The median call."""
+        return float(np.median(self.seconds))
+
+    @property
+    def minimum(self) -> float:
+        """The fastest call, which other processes disturbed least."""
+        return min(self.seconds)
+
+    @property
+    def spread(self) -> float:
+        """Interquartile range over the median."""
+        low, high = np.percentile(self.seconds, [25, 75])
+        return float((high - low) / self.median)
+
+    @property
+    def compile(self) -> float:
+        """What the first call took beyond a median one."""
+        return max(self.first - self.median, 0.0)
+
+    def __str__(self) -> str:
+        return f"{1e3 * self.median:.3g} ms ± {50 * self.spread:.0f} %"
+
+    def record(self) -> dict[str, Any]:
+        """Everything, for metrics.json."""
+        names = ("median", "minimum", "spread", "compile")
+        return {name: getattr(self, name) for name in names} | self._asdict()
+
+
+def measure(variants: Variants, repeats: int) -> dict[str, Timing]:
+    """Time each variant `repeats` times, in turns, after a first call of each.
+
+    Turns share out what else the machine does. Each call is over when its result is.
+    """
+    first = {name: clock(call) for name, call in variants.items()}
+    rounds = [
+        {name: clock(call) for name, call in variants.items()} for _ in range(repeats)
+    ]
+    return {n: Timing(first[n], tuple(turn[n] for turn in rounds)) for n in variants}
+
+
+def clock(call: Callable[[], Any]) -> float:
+    """Wall seconds until the result of one call is there."""
+    begin = time.perf_counter()
+    jax.block_until_ready(call())
+    return time.perf_counter() - begin
+
+
+def load() -> float:
+    """Processes that want a core, averaged over a minute: above 1 others compete."""
+    return os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
+
+
+def describe() -> str:
+    """One line a report begins with: device, cores, load and versions."""
+    env = environment()
+    packages = ", ".join(f"{name} {v}" for name, v in env["packages"].items())
+    return (
+        f"{env['processor']}, {env['cores']} cores, {env['devices']} JAX device(s) "
+        f"({env['device']}), load {load():.1f}; python {env['python']}, {packages}."
+    )

@@ -1,0 +1,388 @@
+"""Ambient occlusion from nothing to a trained network, images and tables.
+
+    python -m experiments.ao_train --out runs/ao_train
+
+makes procedural shapes, ray-traces their ambient occlusion, trains, and evaluates on
+shapes that training never saw. `--help` lists every option with its default.
+"""
+
+import sys
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeRemainingColumn,
+)
+
+from ginn_jax import architecture, evaluate, fit, report, scenes
+from ginn_jax.errors import InputError
+from ginn_jax.geometry import Limits
+from ginn_jax.mesh import find_meshes
+from ginn_jax.process import available_cores, tune_process
+from ginn_jax.train import Training
+
+UNSEEN_SEED = 10_000_000
+VALIDATION_RAYS = 1024
+DISK_RADII = (0.015, 0.02, 0.03)
+RAY_COUNTS = (1, 4, 16, 64, 256)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Train ambient occlusion on point clouds and evaluate it on unseen objects."""
+
+    out: Path = Path("runs/ao_train")
+    """Folder for data, checkpoints, metrics.json, report.md and figures."""
+    shapes: int = 240
+    """Procedural shapes to train on."""
+    meshes: Path | None = None
+    """A mesh file or a folder of meshes to train on as well."""
+    test_shapes: int = 12
+    """Procedural shapes to evaluate on; training never sees them."""
+    test_meshes: Path | None = None
+    """A mesh file or a folder of unseen meshes to evaluate on as well."""
+    rays: int = 64
+    """Rays per training point."""
+    radius: float = 0.1
+    """Occlusion radius, in units of the object's longest side."""
+    points: int = 20_000
+    """Samples per object."""
+    preset: Literal["default", "paper", "released"] = "default"
+    """Layer table: ours, the paper's, or the authors' release."""
+    schedule: Literal["cosine", "paper"] = "cosine"
+    """Learning rate: warm-up and cosine decay, or the paper's x0.7 every 10 epochs."""
+    steps: int = 2000
+    """Training steps."""
+    batch: int = 2
+    """Clouds per step (the paper: 8)."""
+    learning_rate: float = 0.005
+    """Adam's learning rate at its highest."""
+    resolution: int = 512
+    """Side of the evaluation images in pixels."""
+    seed: int = 0
+    """Seed of everything."""
+    resume: bool = False
+    """Go on where a killed run with the same options was."""
+    quick: bool = False
+    """A run of about a minute on little data: to try things, not for numbers."""
+
+
+@dataclass
+class Clock:
+    """Wall seconds of the parts of a run."""
+
+    start: float = field(default_factory=time.perf_counter)
+    parts: dict[str, float] = field(default_factory=dict)
+
+    def lap(self, name: str, since: float) -> None:
+        """Add the time since `since` to a part."""
+        self.parts[name] = self.parts.get(name, 0.0) + time.perf_counter() - since
+
+
+QUICK = {
+    "shapes": 8,
+    "test_shapes": 3,
+    "steps": 30,
+    "points": 6000,
+    "resolution": 96,
+    "rays": 16,
+}
+
+
+def main(options: Options) -> dict[str, Any]:
+    """Run the experiment; returns what metrics.json holds."""
+    check(options)
+    console = Console()
+    clock = Clock()
+    settings = scenes.Occlusion(options.points, options.rays, options.radius)
+    train_sources = training_sources(options)
+    test_sources = unseen_sources(options)
+    begin = time.perf_counter()
+    clouds = make(console, "training clouds", train_sources, settings, options.out)
+    exact = scenes.Occlusion(options.points, VALIDATION_RAYS, options.radius)
+    unseen = make(console, "unseen clouds", test_sources, exact, options.out)
+    clock.lap("data", begin)
+
+    config = training(options, len(clouds))
+    extra = {"occlusion": asdict(settings), "objects": [s.name for s in train_sources]}
+    with bar(console) as progress:
+        task = progress.add_task("training", total=config.steps, note="compiling")
+
+        def tell(step: int, loss: float, note: str) -> None:
+            rate = step / max(time.perf_counter() - begin, 1e-9)
+            text = note or f"loss {loss:.5f}, {rate:.1f} steps/s"
+            progress.update(task, completed=step, note=text)
+            if not console.is_terminal and (note or step % 100 == 0):
+                console.print(f"step {step} of {config.steps}: {text}")
+
+        begin = time.perf_counter()
+        run = fit.fit(
+            config, clouds, options.out, fit.Schedule(), tell, options.resume, extra
+        )
+    clock.parts |= run.seconds
+
+    begin = time.perf_counter()
+    metrics = evaluation(options, run, config, unseen, test_sources, clouds)
+    clock.lap("evaluation", begin)
+    metrics |= {f"seconds_{name}": seconds for name, seconds in clock.parts.items()}
+    metrics |= {
+        "seconds_total": time.perf_counter() - clock.start,
+        "peak_memory_gib": report.peak_memory_gib(),
+        "steps": int(run.state.step),
+        "skipped_steps": int(run.state.skipped),
+        "limits": dict(run.limits.sizes),
+        "limits_raised": run.raised,
+        "options": {k: str(v) for k, v in asdict(options).items()},
+        "training": asdict(config),
+        "environment": report.environment(),
+    }
+    report.write_results(options.out, metrics, write_report(metrics))
+    console.print(
+        f"relative 3D MSE {metrics['relative_mse_3d']:.2%} on unseen shapes, "
+        f"{metrics['seconds_total'] / 60:.1f} minutes: {options.out / 'report.md'}"
+    )
+    return metrics
+
+
+def check(options: Options) -> None:
+    """Raise `InputError` for options that cannot be meant."""
+    least = {"shapes": 0, "test_shapes": 1, "rays": 2, "points": 1000, "steps": 1}
+    least |= {"batch": 1, "resolution": 32, "seed": 0}
+    for name, minimum in least.items():
+        if getattr(options, name) < minimum:
+            raise InputError(
+                f"--{name.replace('_', '-')} is {getattr(options, name)}: "
+                f"give at least {minimum}"
+            )
+    for name in ("radius", "learning_rate"):
+        value = getattr(options, name)
+        if not (np.isfinite(value) and value > 0):
+            raise InputError(f"--{name.replace('_', '-')} is {value}: give it above 0")
+
+
+def training_sources(options: Options) -> list[scenes.Source]:
+    """Procedural shapes and the user's meshes."""
+    sources = scenes.procedural_sources(options.shapes, options.seed * 100_000)
+    if options.meshes is not None:
+        sources += scenes.file_sources(find_meshes(options.meshes))
+    return sources
+
+
+def unseen_sources(options: Options) -> list[scenes.Source]:
+    """Procedural shapes of other seeds, and the user's test meshes."""
+    sources = scenes.procedural_sources(options.test_shapes, UNSEEN_SEED + options.seed)
+    if options.test_meshes is not None:
+        sources += scenes.file_sources(find_meshes(options.test_meshes))
+    return sources
+
+
+def make(
+    console: Console,
+    what: str,
+    sources: list[scenes.Source],
+    settings: scenes.Occlusion,
+    out: Path,
+) -> list[scenes.ShadedPoints]:
+    """Make, or find, the clouds of all sources."""
+    folder = out / "data" / f"{what.split()[0]}_{settings.rays}"
+    workers = min(available_cores(), 8)
+    with bar(console) as progress:
+        task = progress.add_task(what, total=len(sources), note="")
+        for _ in scenes.make_clouds(sources, settings, folder, workers):
+            progress.advance(task)
+    return scenes.read_clouds(sources, settings, folder)
+
+
+def bar(console: Console) -> Progress:
+    """A progress bar with time left."""
+    columns = (MofNCompleteColumn(), TimeRemainingColumn())
+    text = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    return Progress(*text, *columns, console=console, disable=not console.is_terminal)
+
+
+def training(options: Options, clouds: int) -> Training:
+    """The training configuration that the options ask for."""
+    return Training(
+        architecture.PRESETS[options.preset],
+        steps=options.steps,
+        batch_size=options.batch,
+        points=options.points * 4 // 5,
+        queries=options.points // 5,
+        learning_rate=options.learning_rate,
+        schedule=options.schedule,
+        epoch_steps=max(clouds // options.batch, 1),
+        seed=options.seed,
+    )
+
+
+def evaluation(
+    options: Options,
+    run: fit.Fit,
+    config: Training,
+    unseen: list[scenes.ShadedPoints],
+    sources: list[scenes.Source],
+    clouds: list[scenes.ShadedPoints],
+) -> dict[str, Any]:
+    """All errors of the trained network; draws the figures."""
+    variables = jax.device_put(run.state.variables, jax.devices()[0])
+    model = evaluate.Model(variables, jax.random.key(options.seed))
+    names = [s.name for s in sources]
+    rows, limits = evaluate.evaluate_clouds(
+        config.network, run.limits, model, unseen, names, VALIDATION_RAYS
+    )
+    procedural = [r for r, s in zip(rows, sources, strict=True) if s.path is None]
+    files = [r for r, s in zip(rows, sources, strict=True) if s.path is not None]
+    metrics = evaluate.pool_rows(procedural) | {"unseen_shapes": procedural}
+    if files:
+        metrics |= {"unseen_meshes_pooled": evaluate.pool_rows(files)}
+        metrics |= {"unseen_meshes": files}
+    floor = float(np.mean([np.mean(c.variance) for c in clouds]))
+    report.draw_curve(options.out / "learning_curve.png", run.losses, floor)
+    shown = list(zip(sources, unseen, strict=True))[:3]
+    if files:
+        shown = [
+            *shown[:2],
+            *list(zip(sources, unseen, strict=True))[len(procedural) :][:2],
+        ]
+    return metrics | image_evaluation(options, config, limits, model, shown)
+
+
+def image_evaluation(
+    options: Options,
+    config: Training,
+    limits: Limits,
+    model: evaluate.Model,
+    shown: list[tuple[scenes.Source, scenes.ShadedPoints]],
+) -> dict[str, Any]:
+    """Images of unseen objects, and error against run time on the same pixels."""
+    pictures, rows = [], []
+    network = config.network
+    own = network.levels[0]
+    radii = sorted({own, *(r for r in DISK_RADII if r < network.query.radius)})
+    views = [
+        evaluate.reference_view(
+            scenes.load_object(source),
+            options.radius,
+            VALIDATION_RAYS,
+            i,
+            options.resolution,
+        )
+        for i, (source, _) in enumerate(shown)
+    ]
+    for radius in radii[:1] if options.quick else radii:
+        held = limits
+        for (source, cloud), view in zip(shown, views, strict=True):
+            row, image, held = evaluate.network_row(
+                network, held, model, cloud, view, radius
+            )
+            rows.append(row | {"name": source.name})
+            if radius == own or options.quick:
+                pictures.append((source.name, view.reference, image))
+    for i, view in enumerate(views):
+        for rays in RAY_COUNTS:
+            row = evaluate.ray_row(view, options.radius, rays, seed=1000 + i)
+            rows.append(row | {"name": shown[i][0].name})
+    means = evaluate.mean_rows(rows)
+    groups = {
+        "network (f_3D + f_2D)": [r for r in means if "disk_radius" in r],
+        "ray tracing": [r for r in means if "rays" in r],
+    }
+    report.draw_views(options.out / "views.png", pictures)
+    report.draw_error_against_time(options.out / "error_against_time.png", groups)
+    best = next(r for r in means if r.get("disk_radius") in (own, radii[0]))
+    mine = next((r for r in means if r.get("disk_radius") == own), best)
+    return {
+        "mse_2d": mine["mse_2d"],
+        "dssim_2d": mine["dssim_2d"],
+        "foreground_pixels": [int(v.gbuffer.mask.sum()) for v in views],
+        "error_against_time": means,
+        "error_against_time_rows": rows,
+    }
+
+
+def write_report(m: dict[str, Any]) -> str:
+    """report.md: what was done, how good it is, how long it took."""
+    columns = {"name": "object", "points": "points", "mse_3d": "3D MSE"}
+    columns |= {"relative_mse_3d": "relative", "noise_floor_3d": "noise floor"}
+    times = {"method": "method", "points": "points", "mse_2d": "2D MSE"}
+    times |= {"dssim_2d": "DSSIM", "seconds_3d": "f_3D s", "seconds_2d": "f_2D s"}
+    times |= {"seconds": "total s"}
+    pooled = [{"set": "unseen procedural shapes", **m}]
+    if "unseen_meshes_pooled" in m:
+        pooled.append({"set": "unseen meshes", **m["unseen_meshes_pooled"]})
+    heads = {"set": "set", "clouds": "clouds", "mse_3d": "3D MSE"}
+    heads |= {"relative_mse_3d": "relative 3D MSE", "noise_floor_3d": "noise floor"}
+    heads |= {"median_relative_mse_3d": "median relative", "equal_rays": "equal rays"}
+    env, options = m["environment"], m["options"]
+    seconds = {k[8:]: v for k, v in m.items() if k.startswith("seconds_")}
+    return f"""# Ambient occlusion
+
+Preset {options["preset"]}, levels {m["training"]["network"]["levels"]}, f_2D radius
+{m["training"]["network"]["query"]["radius"]}, {m["steps"]} steps of
+{options["batch"]} clouds, occlusion radius {options["radius"]}, seed {options["seed"]}.
+{env["processor"]}, {env["cores"]} cores, {env["devices"]} JAX devices,
+jax {env["packages"]["jax"]}, mitsuba {env["packages"]["mitsuba"]}.
+Skipped steps (non-finite gradient): {m["skipped_steps"]}. Limits raised on the way:
+{", ".join(m["limits_raised"]) or "none"}. Peak memory {m["peak_memory_gib"]:.2f} GiB.
+
+## Error at points
+
+MSE is against the expectation of the ray-traced target (its noise is subtracted);
+relative is over the variance of the target, pooled over the clouds; equal rays is the
+number of rays per point at which ray tracing has the same MSE.
+
+{report.table_of(pooled, heads)}
+## Error against run time
+
+Means over {len(m["foreground_pixels"])} unseen objects at {options["resolution"]} x
+{options["resolution"]} ({", ".join(map(str, m["foreground_pixels"]))} foreground
+pixels), same pixels, same machine, same run; compilation and G-buffer apart. DSSIM
+after the paper's tone mapping, over the foreground.
+
+{report.table_of(m["error_against_time"], times)}
+![error against run time](error_against_time.png)
+
+![reference, network, difference](views.png)
+
+## Training
+
+![learning curve](learning_curve.png)
+
+{report.markdown_table(list(seconds), [[f"{v:.1f} s" for v in seconds.values()]])}
+## Every unseen object
+
+{report.table_of(m["unseen_shapes"] + m.get("unseen_meshes", []), columns)}"""
+
+
+def run() -> None:
+    """Command line: mistakes end in one line and exit code 2."""
+    options = tyro.cli(Options, description=__doc__)
+    if options.quick:
+        changed = asdict(options)
+        default = asdict(Options())
+        changed |= {k: v for k, v in QUICK.items() if changed[k] == default[k]}
+        options = Options(**changed)
+    tune_process()
+    try:
+        main(options)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    run()

@@ -1,0 +1,149 @@
+"""The network as a table of layers: Python numbers only, hashable, static under jit."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+QUERY = -1
+
+
+@dataclass(frozen=True)
+class Conv:
+    """One Monte Carlo convolution and the 1x1 layer before it.
+
+    `before` says what happens to its input: "raw" nothing; "norm" normalise and
+    activate; "dense" the same, then a 1x1 layer to `channels`, then the same again;
+    "lift" a 1x1 layer to `channels`, then normalise and activate. A convolution that
+    `mixes` has a kernel for every pair of input and output channels, the others one for
+    each channel. `skip` names the convolution whose output (with its own skip) is
+    concatenated in front.
+    """
+
+    name: str
+    source: int
+    target: int
+    radius: float
+    bandwidth: float
+    channels: int
+    before: Literal["raw", "norm", "dense", "lift"] = "dense"
+    mixes: bool = False
+    skip: str | None = None
+
+
+@dataclass(frozen=True)
+class Network:
+    """f_3D and f_2D. Radii are in units of the object's longest side.
+
+    levels      Poisson disk radii of the hierarchy, finest first
+    encoder     the convolutions of f_3D, in order
+    latent      channels of the code per point that f_3D hands to f_2D
+    query       the one convolution of f_2D, from level 0 to the queries
+    head        width of the layer between that convolution and the output
+    hidden      width of the kernel perceptrons
+    group       kernel values per perceptron: the paper's blocks; 0 for one shared block
+    oriented    whether kernels see normals beside offsets
+    density     how senders are weighted, see `mcconv`
+    norm        "batch" with running moments, "layer" over channels, or "none"
+    """
+
+    levels: tuple[float, ...]
+    encoder: tuple[Conv, ...]
+    query: Conv
+    latent: int
+    head: int
+    hidden: int = 16
+    group: int = 0
+    oriented: bool = True
+    density: Literal["kde", "surface"] = "surface"
+    norm: Literal["batch", "layer", "none"] = "layer"
+
+
+def released_table(k: int, radii: tuple[float, ...]) -> tuple[Conv, ...]:
+    """The authors' eleven convolutions but the last, for four levels and base width k.
+
+    `radii` are those of levels 1, 2, 3; receptive fields are twice as wide, within the
+    last level 1.0, within level 2 as in the release.
+    """
+    fine, middle, coarse = radii
+    return (
+        Conv("conv_1", 0, 0, 0.025, 0.25, k, "raw", mixes=True),
+        Conv("pool_1", 0, 1, fine, 0.2, 2 * k),
+        Conv("conv_2", 1, 1, 2 * fine, 0.25, 2 * k, skip="pool_1"),
+        Conv("pool_2", 1, 2, 2 * middle, 0.2, 4 * k),
+        Conv("conv_3", 2, 2, 2 * middle, 0.25, 4 * k, skip="pool_2"),
+        Conv("pool_3", 2, 3, 2 * coarse, 0.2, 8 * k),
+        Conv("conv_4", 3, 3, 1.0, 0.2, 8 * k),
+        Conv("up_3", 3, 2, 2 * coarse, 0.2, 8 * k, "norm", skip="conv_3"),
+        Conv("up_2", 2, 1, 2 * middle, 0.2, 4 * k, skip="conv_2"),
+        Conv("up_1", 1, 0, 2 * fine, 0.2, 2 * k, skip="conv_1"),
+    )
+
+
+RELEASED = Network(
+    levels=(0.01, 0.05, 0.1, 0.2),
+    encoder=released_table(8, (0.05, 0.1, 0.2)),
+    query=Conv("query", 0, QUERY, 0.05, 0.2, 8),
+    latent=8,
+    head=8,
+    hidden=4,
+    group=4,
+    oriented=False,
+    density="kde",
+    norm="batch",
+)
+
+PAPER = replace(
+    RELEASED,
+    levels=(0.01, 0.05, 0.15, 0.5),
+    encoder=released_table(8, (0.05, 0.15, 0.5)),
+    hidden=8,
+    group=8,
+)
+
+
+def compact_table(
+    k: int, radii: tuple[float, ...], within: float, between: float
+) -> tuple[Conv, ...]:
+    """An encoder-decoder over any number of levels.
+
+    Fields are `within` spacings wide inside a level and `between` spacings of the
+    coarser level across two.
+    """
+    rows = [Conv("conv_0", 0, 0, within * radii[0], 0.25, k, "lift")]
+    for level in range(1, len(radii)):
+        field, width = radii[level], k << level
+        pool = f"pool_{level}"
+        rows += [
+            Conv(pool, level - 1, level, between * field, 0.25, width),
+            Conv(f"conv_{level}", level, level, within * field, 0.25, width, skip=pool),
+        ]
+    for level in range(len(radii) - 1, 0, -1):
+        field, width = between * radii[level], k << (level - 1)
+        skip = f"conv_{level - 1}"
+        rows.append(
+            Conv(f"up_{level}", level, level - 1, field, 0.25, width, skip=skip)
+        )
+    return tuple(rows)
+
+
+def compact_network(
+    k: int = 16,
+    levels: tuple[float, ...] = (0.02, 0.05, 0.1),
+    within: float = 2.5,
+    between: float = 1.5,
+    query_radius: float = 0.05,
+    latent: int = 16,
+    **more,
+) -> Network:
+    """Ours: shared oriented kernels, surface weights, few levels."""
+    return Network(
+        levels=levels,
+        encoder=compact_table(k, levels, within, between),
+        query=Conv("query", 0, QUERY, query_radius, 0.25, latent),
+        latent=latent,
+        head=latent,
+        **more,
+    )
+
+
+DEFAULT = compact_network()
+PRESETS = {"default": DEFAULT, "paper": PAPER, "released": RELEASED}

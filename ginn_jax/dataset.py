@@ -1,0 +1,115 @@
+"""Shaded points, the one type for a cloud and a G-buffer, and clouds on disk."""
+
+import json
+import os
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+from ginn_jax.errors import InputError
+from ginn_jax.mcconv import Oriented
+
+# Clouds of a batch stand this far apart: more than any radius and both extents.
+SPACING = 4.0
+
+# What `np.load` raises for a damaged archive, beside the obvious.
+_DAMAGE = (zipfile.BadZipFile, RuntimeError, TypeError)
+
+
+class ShadedPoints(NamedTuple):
+    """Points with what shades them and what they are shaded to.
+
+    Leading dimensions are [N] for a cloud, [B, N] for a batch, [H, W] for an image: a
+    pixel is a point. `variance` is the Monte Carlo variance of `target`.
+    """
+
+    position: Float[Array, "*P 3"]
+    normal: Float[Array, "*P 3"]
+    target: Float[Array, "*P"]
+    variance: Float[Array, "*P"]
+
+
+def save_cloud(path: Path, cloud: ShadedPoints, origin: dict[str, Any]) -> None:
+    """Write a cloud and what made it, atomically: a killed run leaves no half file."""
+    partial = path.with_suffix(f".{os.getpid()}.partial")
+    with open(partial, "wb") as file:
+        np.savez(file, origin=json.dumps(origin, sort_keys=True), **cloud._asdict())
+    os.replace(partial, path)
+
+
+def load_cloud(path: Path, origin: dict[str, Any] | None = None) -> ShadedPoints:
+    """Read a cloud back.
+
+    Raises:
+        InputError: a missing or damaged file, or one made by something else than
+            `origin`.
+    """
+    try:
+        with np.load(path) as file:
+            found = json.loads(str(file["origin"]))
+            cloud = ShadedPoints(*(file[name] for name in ShadedPoints._fields))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such cloud") from None
+    except (OSError, ValueError, KeyError, EOFError, *_DAMAGE):
+        raise InputError(
+            f"{path} is damaged: delete it to have it made again"
+        ) from None
+    if origin is not None and found != json.loads(json.dumps(origin)):
+        raise InputError(f"{path} was made with other settings: choose another folder")
+    return cloud
+
+
+def stack_clouds(clouds: Sequence[ShadedPoints]) -> ShadedPoints:
+    """A batch from clouds of equal size."""
+    return ShadedPoints(*(np.stack(column) for column in zip(*clouds, strict=True)))
+
+
+def rotate_about_up(cloud: ShadedPoints, *, key: Key[Array, ""]) -> ShadedPoints:
+    """Turn positions and normals together by a random angle about the vertical axis."""
+    angle = jax.random.uniform(key, (), maxval=2 * jnp.pi)
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    turn = jnp.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    product = jax.lax.Precision.HIGHEST
+    return cloud._replace(
+        position=jnp.matmul(cloud.position, turn.T, precision=product),
+        normal=jnp.matmul(cloud.normal, turn.T, precision=product),
+    )
+
+
+def side_by_side(batch: ShadedPoints) -> ShadedPoints:
+    """One cloud from a batch: the clouds stand next to each other, out of reach.
+
+    Every stage is written for one cloud; this batches them all without a `vmap`, and
+    one capacity serves the whole batch.
+    """
+    shift = SPACING * jnp.arange(batch.position.shape[0], dtype=jnp.float32)
+    position = batch.position.at[..., 0].add(shift[:, None])
+    return jax.tree.map(
+        lambda a: a.reshape(-1, *a.shape[2:]), batch._replace(position=position)
+    )
+
+
+def oriented(cloud: ShadedPoints) -> Oriented:
+    """The geometry of a cloud, no point masked out."""
+    return Oriented(
+        cloud.position, cloud.normal, jnp.ones(cloud.position.shape[:-1], bool)
+    )
+
+
+def batch_order(
+    clouds: int, batch_size: int, step: int, *, seed: int
+) -> Int[np.ndarray, "B"]:
+    """Which clouds step number `step` trains on: epochs are permutations of the set."""
+    first = step * batch_size
+    places = np.arange(first, first + batch_size)
+    epochs, offsets = np.divmod(places, clouds)
+    orders = {
+        e: np.random.default_rng((seed, e)).permutation(clouds) for e in set(epochs)
+    }
+    return np.array([orders[e][o] for e, o in zip(epochs, offsets, strict=True)])

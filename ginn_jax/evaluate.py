@@ -1,0 +1,223 @@
+"""Errors of a trained network: at points, in images, and against run time."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float, Key
+
+from ginn_jax.architecture import Network
+from ginn_jax.camera import orbit_camera
+from ginn_jax.dataset import ShadedPoints
+from ginn_jax.geometry import Limits
+from ginn_jax.image import (
+    as_openness,
+    encode_cloud,
+    shade_image,
+    shade_points,
+    with_disk_radius,
+)
+from ginn_jax.mesh import Mesh
+from ginn_jax.metrics import dssim, equal_rays, mse, tone_map
+from ginn_jax.network import Variables
+from ginn_jax.reference import (
+    GBuffer,
+    Scene,
+    ambient_occlusion,
+    build_scene,
+    render_gbuffer,
+)
+
+Row = dict[str, Any]
+
+
+class Model(NamedTuple):
+    """A trained network's arrays; its table and capacities go beside it."""
+
+    variables: Variables
+    key: Key[Array, ""]
+
+
+class View(NamedTuple):
+    """One object seen by one camera, with the reference of its foreground pixels."""
+
+    scene: Scene
+    gbuffer: GBuffer
+    reference: Float[np.ndarray, "H W"]
+    variance: Float[np.ndarray, "P"]
+
+
+def evaluate_clouds(
+    network: Network,
+    limits: Limits,
+    model: Model,
+    clouds: Sequence[ShadedPoints],
+    names: Sequence[str],
+    rays: int,
+) -> tuple[list[Row], Limits]:
+    """3D errors of every cloud, one row each. `rays` made the targets.
+
+    The first half of a cloud is the network's input and the second half is where it is
+    asked, so no point is both. Noise is subtracted: `mse` is against the expectation.
+    """
+    rows = []
+    for name, cloud in zip(names, clouds, strict=True):
+        half = len(cloud.position) // 2
+        given, asked = (ShadedPoints(*(a[s] for a in cloud)) for s in _halves(half))
+        encoded, limits = encode_cloud(
+            network,
+            limits,
+            model.variables,
+            given.position,
+            given.normal,
+            key=model.key,
+        )
+        values, limits = shade_points(
+            network, limits, model.variables, encoded, asked.position, asked.normal
+        )
+        noise = float(np.mean(asked.variance))
+        raw = mse(as_openness(values), asked.target)
+        rows.append(
+            {
+                "name": name,
+                "points": int(np.sum(encoded.points.mask)),
+                "raw_mse_3d": raw,
+                "noise_floor_3d": noise,
+                "mse_3d": raw - noise,
+                "variance_3d": float(np.var(asked.target)) - noise,
+                "ray_variance": noise * rays,
+            }
+        )
+        rows[-1]["relative_mse_3d"] = rows[-1]["mse_3d"] / rows[-1]["variance_3d"]
+    return rows, limits
+
+
+def _halves(half: int) -> tuple[slice, slice]:
+    return slice(None, half), slice(half, None)
+
+
+def pool_rows(rows: Sequence[Row]) -> Row:
+    """Means over the clouds; the relative error is a ratio of means, not their mean."""
+    names = ("raw_mse_3d", "mse_3d", "noise_floor_3d", "variance_3d", "ray_variance")
+    pooled = {name: float(np.mean([row[name] for row in rows])) for name in names}
+    return pooled | {
+        "clouds": len(rows),
+        "relative_mse_3d": pooled["mse_3d"] / pooled["variance_3d"],
+        "median_relative_mse_3d": float(
+            np.median([r["relative_mse_3d"] for r in rows])
+        ),
+        "equal_rays": equal_rays(pooled["mse_3d"], pooled["ray_variance"]),
+    }
+
+
+def reference_view(
+    mesh: Mesh, radius: float, rays: int, seed: int, size: int, azimuth: float = 35.0
+) -> View:
+    """An object with its ray-traced ambient occlusion at every foreground pixel."""
+    scene = build_scene(mesh)
+    gbuffer = render_gbuffer(scene, orbit_camera(azimuth, width=size, height=size))
+    mask = gbuffer.mask
+    truth = ambient_occlusion(
+        scene,
+        gbuffer.position[mask],
+        gbuffer.normal[mask],
+        radius,
+        rays=rays,
+        seed=seed,
+    )
+    return View(scene, gbuffer, fill(mask, truth.mean), truth.variance)
+
+
+def fill(
+    mask: Bool[np.ndarray, "H W"], values: Float[np.ndarray, "P"]
+) -> Float[np.ndarray, "H W"]:
+    """An image of the foreground values, open (1) elsewhere."""
+    image = np.ones(mask.shape, np.float32)
+    image[mask] = values
+    return image
+
+
+def image_errors(view: View, image: Float[np.ndarray, "H W"]) -> Row:
+    """2D errors of the foreground: MSE less the noise, tone-mapped DSSIM."""
+    mask, reference = view.gbuffer.mask, view.reference
+    shown = [tone_map(i, reference, mask) for i in (image, reference)]
+    return {
+        "mse_2d": mse(image, reference, mask) - float(np.mean(view.variance)),
+        "dssim_2d": dssim(*shown, mask),
+    }
+
+
+def timed(work: Callable[[], Any], repeats: int = 3) -> tuple[Any, float, float]:
+    """Result, seconds of the first call (with compilation), median of the others."""
+    seconds, result = [], None
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        result = jax.block_until_ready(work())
+        seconds.append(time.perf_counter() - start)
+    return result, seconds[0], float(np.median(seconds[1:]))
+
+
+def network_row(
+    network: Network,
+    limits: Limits,
+    model: Model,
+    cloud: ShadedPoints,
+    view: View,
+    radius: float,
+) -> tuple[Row, Float[np.ndarray, "H W"], Limits]:
+    """Errors and times of the network at one Poisson disk radius, and its image."""
+    network = with_disk_radius(network, radius)
+    arguments = (cloud.position, cloud.normal)
+    _, limits = encode_cloud(
+        network, limits, model.variables, *arguments, key=model.key
+    )
+    (encoded, limits), _, deep = timed(
+        lambda: encode_cloud(
+            network, limits, model.variables, *arguments, key=model.key
+        )
+    )
+    pixels = (view.gbuffer.position, view.gbuffer.normal, view.gbuffer.mask)
+    _, limits = shade_image(network, limits, model.variables, encoded, *pixels)
+    (image, limits), _, flat = timed(
+        lambda: shade_image(network, limits, model.variables, encoded, *pixels)
+    )
+    row = {
+        "method": f"network, disk {radius:g}",
+        "disk_radius": radius,
+        "points": int(np.sum(encoded.points.mask)),
+        "seconds_3d": deep,
+        "seconds_2d": flat,
+        "seconds": deep + flat,
+    }
+    return row | image_errors(view, image), image, limits
+
+
+def ray_row(view: View, radius: float, rays: int, seed: int) -> Row:
+    """Error and time of ray-traced ambient occlusion at `rays` per pixel."""
+    mask = view.gbuffer.mask
+    position, normal = view.gbuffer.position[mask], view.gbuffer.normal[mask]
+    truth, _, seconds = timed(
+        lambda: ambient_occlusion(
+            view.scene, position, normal, radius, rays=rays, seed=seed
+        )
+    )
+    row = {"method": f"{rays} rays", "rays": rays, "seconds": seconds}
+    return row | image_errors(view, fill(mask, truth.mean))
+
+
+def mean_rows(rows: Sequence[Row]) -> list[Row]:
+    """Rows of the same method averaged over the objects, in order of appearance."""
+    methods: dict[str, list[Row]] = {}
+    for row in rows:
+        methods.setdefault(row["method"], []).append(row)
+    return [
+        {"method": method, "objects": len(group)}
+        | {
+            name: float(np.mean([row[name] for row in group]))
+            for name in group[0]
+            if name not in ("method", "name")
+        }
+        for method, group in methods.items()
+    ]

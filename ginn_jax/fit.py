@@ -1,0 +1,162 @@
+"""The training loop of a run: clouds in, weights out, resumable at any step."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from ginn_jax.checkpoint import (
+    load_run,
+    open_manager,
+    restore_state,
+    save_run,
+    save_state,
+)
+from ginn_jax.dataset import ShadedPoints, batch_order, stack_clouds
+from ginn_jax.errors import InputError
+from ginn_jax.geometry import (
+    Limits,
+    exceeded,
+    measure_limits,
+    raise_limits,
+    uniform_limits,
+)
+from ginn_jax.train import (
+    Training,
+    TrainState,
+    batch_mesh,
+    init_state,
+    probe_step,
+    train_step,
+)
+
+PROBES = 60
+PROBE_SLACK = 1.2
+RAISE_SLACK = 1.15
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How often a run reports and saves, in steps."""
+
+    report: int = 10
+    save: int = 250
+
+
+class Fit(NamedTuple):
+    """A finished run: state, capacities, loss of every step, seconds by purpose."""
+
+    state: TrainState
+    limits: Limits
+    losses: np.ndarray
+    seconds: dict[str, float]
+    raised: dict[str, int]
+
+
+Progress = Callable[[int, float, str], None]
+
+
+def fit(
+    config: Training,
+    clouds: Sequence[ShadedPoints],
+    folder: Path,
+    schedule: Schedule,
+    progress: Progress,
+    resume: bool = False,
+    extra: dict[str, Any] | None = None,
+) -> Fit:
+    """Train to `config.steps`, saving under `folder`.
+
+    Where a batch needs more than a limit the limit is raised and the step repeated, on
+    the state it started from. `progress(step, loss, note)` hears of every report.
+
+    Raises:
+        InputError: too few points per cloud, or nothing to resume.
+    """
+    _check(config, clouds)
+    folder.mkdir(parents=True, exist_ok=True)
+    start = time.perf_counter()
+    if resume:
+        limits = load_run(folder, config, extra or {})
+    else:
+        limits = training_limits(config, clouds)
+        save_run(folder, config, limits, extra or {})
+    manager = open_manager(folder, fresh=not resume)
+    state = init_state(config, limits, _batch(config, clouds, 0))
+    losses = np.zeros(0, np.float32)
+    if resume and (found := restore_state(manager, state)) is not None:
+        state, losses = found, load_losses(folder, int(found.step))
+    seconds = {"compile": time.perf_counter() - start, "train": 0.0}
+    history, raised = list(losses), {}
+    while int(state.step) < config.steps:
+        step = int(state.step)
+        begin = time.perf_counter()
+        first_of_shape = train_step._cache_size()
+        state, report = train_step(config, limits, state, _batch(config, clouds, step))
+        loss = float(report.loss)
+        compiled = train_step._cache_size() > first_of_shape
+        seconds["compile" if compiled else "train"] += time.perf_counter() - begin
+        if short := exceeded(limits, jax.device_get(report.demands)):
+            limits = raise_limits(limits, short, RAISE_SLACK)
+            raised |= short
+            progress(step, loss, f"raised {', '.join(short)}")
+            continue
+        history.append(loss)
+        if (step + 1) % schedule.report == 0:
+            progress(step + 1, float(np.mean(history[-schedule.report :])), "")
+        if (step + 1) % schedule.save == 0 or step + 1 == config.steps:
+            save_losses(folder, history)
+            save_run(folder, config, limits, extra or {})
+            save_state(manager, state)
+    manager.close()
+    return Fit(state, limits, np.array(history, np.float32), seconds, raised)
+
+
+def training_limits(config: Training, clouds: Sequence[ShadedPoints]) -> Limits:
+    """Capacities that hold random shares of a batch, with slack."""
+    share = config.batch_size // batch_mesh(config.batch_size).size
+    rng = np.random.default_rng(config.seed)
+    rows = rng.integers(0, len(clouds), (PROBES, share))
+    rows[: len(clouds), 0] = rng.permutation(len(clouds))[:PROBES]
+
+    def probe(limits: Limits, i: int) -> dict[str, Any]:
+        batch = stack_clouds([clouds[j] for j in rows[i]])
+        return jax.device_get(probe_step(config, limits, batch, key=jax.random.key(i)))
+
+    generous = uniform_limits(config.network, 16 * share * config.points)
+    return measure_limits(generous, probe, PROBES, PROBE_SLACK)
+
+
+def save_losses(folder: Path, history: Sequence[float]) -> None:
+    """Keep the loss of every step beside the checkpoints."""
+    np.save(folder / "losses.npy", np.asarray(history, np.float32))
+
+
+def load_losses(folder: Path, steps: int) -> np.ndarray:
+    """The losses of the first `steps` steps; NaN where the file lacks them."""
+    try:
+        found = np.load(folder / "losses.npy")[:steps]
+    except (OSError, ValueError):
+        found = np.zeros(0, np.float32)
+    missing = np.full(steps - len(found), np.nan, np.float32)
+    return np.concatenate([found, missing])
+
+
+def _batch(config: Training, clouds: Sequence[ShadedPoints], step: int) -> ShadedPoints:
+    order = batch_order(len(clouds), config.batch_size, step, seed=config.seed)
+    return stack_clouds([clouds[i] for i in order])
+
+
+def _check(config: Training, clouds: Sequence[ShadedPoints]) -> None:
+    if not clouds:
+        raise InputError("no training clouds: ask for at least one shape")
+    fewest = min(len(c.position) for c in clouds)
+    if fewest < config.points:
+        raise InputError(
+            f"a training cloud has {fewest} points, a step takes {config.points}: "
+            "sample more, or train on fewer"
+        )

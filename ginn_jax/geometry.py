@@ -1,0 +1,298 @@
+"""Everything about a cloud that no parameter enters: levels, edges, weights.
+
+Every search has capacities, collected in one `Limits`; every search reports its true
+demand under the same name, so a caller can tell which limit to raise.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int, Key
+
+from ginn_jax.architecture import Conv, Network
+from ginn_jax.hierarchy import Level, LevelLimit, build_level
+from ginn_jax.mcconv import (
+    Field,
+    Oriented,
+    kde_weight,
+    kernel_inputs,
+    point_area,
+    surface_weight,
+)
+from ginn_jax.neighbors import EdgeLimit, Edges, VoxelGrid, build_grid, radius_edges
+
+Demands = dict[str, Int[Array, ""]]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Named capacities; hashable, so that they can be static under jit."""
+
+    sizes: tuple[tuple[str, int], ...]
+
+    def of(self, name: str) -> int:
+        """The capacity called `name`."""
+        return dict(self.sizes)[name]
+
+
+class Geometry(NamedTuple):
+    """What f_3D and f_2D need of a cloud.
+
+    levels  the hierarchy, finest first; `finest` are its points' rows in the cloud
+    fields  the receptive field of each convolution of f_3D
+    area    the area each finest point stands for, where senders are so weighted
+    grid    the finest level, ready for f_2D's search
+    """
+
+    levels: tuple[Oriented, ...]
+    finest: Int[Array, "N"]
+    fields: dict[str, Field]
+    area: Array | None
+    grid: VoxelGrid
+
+
+def fits(limits: Limits, demands: Demands) -> Bool[Array, ""]:
+    """Whether every demand is within its limit."""
+    return jnp.all(jnp.stack([d <= limits.of(name) for name, d in demands.items()]))
+
+
+def exceeded(limits: Limits, demands: Demands) -> dict[str, int]:
+    """Host: the limits that were too small, and what each should have been."""
+    wanted = {name: int(np.max(demand)) for name, demand in demands.items()}
+    return {name: need for name, need in wanted.items() if need > limits.of(name)}
+
+
+def raise_limits(limits: Limits, demands: dict[str, int], slack: float) -> Limits:
+    """Limits that hold each of these demands and `slack` times as much."""
+    sizes = dict(limits.sizes)
+    for name, need in demands.items():
+        sizes[name] = max(sizes[name], round_up(int(need * slack)))
+    return Limits(tuple(sizes.items()))
+
+
+def round_up(count: int) -> int:
+    """A capacity with at most 1/16 to spare, so that few shapes are compiled."""
+    step = 1 << max(count.bit_length() - 4, 6)
+    return -(-count // step) * step
+
+
+def limit_names(config: Network) -> tuple[str, ...]:
+    """The name of every capacity of a network."""
+    names = [
+        f"level_{i}.{part}"
+        for i in range(len(config.levels))
+        for part in ("candidates", "edges", "points")
+    ]
+    for conv in (*config.encoder, config.query):
+        if conv is not config.query and transposed(config, conv):
+            continue
+        names += [f"{conv.name}.candidates", f"{conv.name}.edges"]
+        names += [f"{conv.name}.pairs"] if config.density == "kde" else []
+    return tuple(names)
+
+
+def uniform_limits(config: Network, size: int) -> Limits:
+    """The same capacity for everything: where measuring starts."""
+    return Limits(tuple((name, size) for name in limit_names(config)))
+
+
+def search(
+    conv: Conv, limits: Limits, grid: VoxelGrid, receivers: Oriented
+) -> tuple[Edges, Demands]:
+    """Edges of one convolution and their demands; `grid` holds the senders."""
+    names = [f"{conv.name}.{part}" for part in ("candidates", "edges")]
+    limit = EdgeLimit(*(limits.of(name) for name in names))
+    edges = radius_edges(
+        grid, receivers.position, receivers.mask, jnp.float32(conv.radius), limit
+    )
+    return edges, dict(zip(names, edges.demand, strict=True))
+
+
+def turn_edges(edges: Edges, senders: int, receivers: int) -> Edges:
+    """The same pairs the other way round; receivers are then in no order."""
+    real = edges.receiver < receivers
+    return Edges(
+        jnp.where(real, edges.receiver, 0),
+        jnp.where(real, edges.sender, senders),
+        edges.demand,
+    )
+
+
+def receptive_field(
+    config: Network,
+    conv: Conv,
+    limits: Limits,
+    senders: Oriented,
+    receivers: Oriented,
+    edges: Edges,
+    area: Array | None,
+) -> tuple[Field, Demands]:
+    """Kernel inputs and weights of every edge; `area` is of the senders."""
+    radius = jnp.float32(conv.radius)
+    inputs = kernel_inputs(senders, receivers, edges, radius, config.oriented)
+    demands: Demands = {}
+    if area is None:
+        name = f"{conv.name}.pairs"
+        weight, demands[name] = kde_weight(
+            senders.position,
+            receivers.position,
+            edges,
+            radius,
+            conv.bandwidth,
+            limits.of(name),
+        )
+    else:
+        weight = surface_weight(area, edges, receivers.mask.shape[0], radius)
+    return Field(edges.sender, edges.receiver, inputs, weight), demands
+
+
+def build_geometry(
+    config: Network, limits: Limits, cloud: Oriented, *, key: Key[Array, ""]
+) -> tuple[Geometry, Demands]:
+    """All of f_3D's geometry; wrong where a demand exceeds its limit."""
+    levels, grids, finest, demands = _build_levels(config, limits, cloud, key)
+    found: dict[str, Edges] = {}
+    for conv in reversed(config.encoder):
+        receivers = levels[conv.target]
+        twin = transposed(config, conv)
+        if twin in found:
+            count = levels[conv.source].mask.shape[0]
+            found[conv.name] = turn_edges(found[twin], receivers.mask.shape[0], count)
+            continue
+        grid = grid_of(grids, conv.source, levels[conv.source], conv.radius)
+        found[conv.name], more = search(conv, limits, grid, receivers)
+        demands |= more
+    areas = _level_areas(config, levels, found)
+    fields = {}
+    for conv in config.encoder:
+        ends = levels[conv.source], levels[conv.target]
+        fields[conv.name], more = receptive_field(
+            config, conv, limits, *ends, found[conv.name], areas.get(conv.source)
+        )
+        demands |= more
+    grid = grid_of(grids, 0, levels[0], config.query.radius)
+    return Geometry(levels, finest, fields, areas.get(0), grid), demands
+
+
+def grid_of(
+    grids: dict[tuple[int, float], VoxelGrid],
+    level: int,
+    points: Oriented,
+    radius: float,
+) -> VoxelGrid:
+    """The grid of a level (-1: the cloud) and a radius, built when first asked."""
+    if (level, radius) not in grids:
+        grids[level, radius] = build_grid(
+            points.position, points.mask, jnp.float32(radius)
+        )
+    return grids[level, radius]
+
+
+def transposed(config: Network, conv: Conv) -> str | None:
+    """The later convolution over the same pairs in the other direction, if any.
+
+    The paper's density needs edges sorted by receiver, so there each is searched.
+    """
+    if config.density == "kde":
+        return None
+    for other in config.encoder[config.encoder.index(conv) + 1 :]:
+        ends = (other.target, other.source, other.radius)
+        if (
+            ends == (conv.source, conv.target, conv.radius)
+            and other.source != other.target
+        ):
+            return other.name
+    return None
+
+
+def _build_levels(
+    config: Network, limits: Limits, cloud: Oriented, key: Key[Array, ""]
+) -> tuple[
+    tuple[Oriented, ...],
+    dict[tuple[int, float], VoxelGrid],
+    Int[Array, "N"],
+    Demands,
+]:
+    """The Poisson disk hierarchy of a cloud, and which points make its finest level."""
+    grids: dict[tuple[int, float], VoxelGrid] = {}
+    levels: list[Level] = []
+    demands: Demands = {}
+    points = cloud
+    for i, radius in enumerate(config.levels):
+        names = [f"level_{i}.{part}" for part in ("candidates", "edges", "points")]
+        candidates, edges, kept = (limits.of(name) for name in names)
+        level, demand = build_level(
+            grid_of(grids, i - 1, points, radius),
+            *points,
+            jnp.float32(radius),
+            LevelLimit(EdgeLimit(candidates, edges), kept),
+            key=jax.random.fold_in(key, i),
+        )
+        demands |= dict(zip(names, (*demand.search, demand.points), strict=True))
+        levels.append(level)
+        points = Oriented(level.position, level.normal, level.mask)
+    ends = tuple(Oriented(lv.position, lv.normal, lv.mask) for lv in levels)
+    return ends, grids, levels[0].index, demands
+
+
+def _level_areas(
+    config: Network, levels: Sequence[Oriented], found: dict[str, Edges]
+) -> dict[int, Array]:
+    """Point areas of each level, from the convolution within it."""
+    if config.density == "kde":
+        return {}
+    within = {c.source: c for c in config.encoder if c.source == c.target}
+    return {
+        i: point_area(
+            levels[i].position, levels[i].mask, found[c.name], jnp.float32(c.radius)
+        )
+        for i, c in within.items()
+    }
+
+
+def build_query_field(
+    config: Network,
+    limits: Limits,
+    finest: Oriented,
+    grid: VoxelGrid,
+    area: Array | None,
+    queries: Oriented,
+) -> tuple[Field, Demands]:
+    """The field of f_2D: from the finest level, its grid and areas, to the queries."""
+    edges, demands = search(config.query, limits, grid, queries)
+    field, more = receptive_field(
+        config, config.query, limits, finest, queries, edges, area
+    )
+    return field, demands | more
+
+
+def measure_limits(
+    limits: Limits, probe: Callable[[Limits, int], Demands], count: int, slack: float
+) -> Limits:
+    """Host: limits that hold the demands of `count` probes, with slack.
+
+    `probe(limits, i)` builds the geometry of example i. `limits` should be generous:
+    the first example is probed with them, the others with twice what the first needed.
+    """
+    largest: dict[str, int] = {}
+    for i in range(count):
+        demands = probe(limits, i)
+        while short := exceeded(limits, demands):
+            limits = raise_limits(limits, short, 2.0)
+            demands = probe(limits, i)
+        for name, demand in demands.items():
+            largest[name] = max(largest.get(name, 0), int(np.max(demand)))
+        if i == 0:
+            limits = limits_for(largest, 2.0)
+    return limits_for(largest, slack)
+
+
+def limits_for(demands: dict[str, int], slack: float) -> Limits:
+    """Limits of `slack` times each demand."""
+    return Limits(
+        tuple((name, round_up(int(d * slack))) for name, d in demands.items())
+    )

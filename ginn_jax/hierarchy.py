@@ -1,0 +1,159 @@
+"""Poisson disk sampling in parallel, and the levels it builds."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key, UInt32
+
+from ginn_jax.neighbors import (
+    Demand,
+    EdgeLimit,
+    VoxelGrid,
+    bucket,
+    compact,
+    find_neighbors,
+    radius_edges,
+)
+
+WAITING, DROPPED, KEPT = 1, 0, 2
+
+
+@dataclass(frozen=True)
+class LevelLimit:
+    """Capacities of one Poisson disk step: its search and the points it keeps."""
+
+    search: EdgeLimit
+    points: int
+
+
+class LevelDemand(NamedTuple):
+    """What one Poisson disk step needed."""
+
+    search: Demand
+    points: Int[Array, ""]
+
+
+class Level(NamedTuple):
+    """Points at least `radius` apart; `index` are their rows one level finer."""
+
+    position: Float[Array, "N 3"]
+    normal: Float[Array, "N 3"]
+    index: Int[Array, "N"]
+    mask: Bool[Array, "N"]
+
+
+def elect(
+    sender: Int[Array, "E"], receiver: Int[Array, "E"], mask: Bool[Array, "N"]
+) -> Bool[Array, "N"]:
+    """Points that survive, given edges from each point's conflicting betters to it.
+
+    A point is kept once all its betters are dropped and dropped once one is kept, so
+    the outcome is that of sequential dart throwing in priority order, found in a number
+    of rounds that is the length of the longest chain of waiting points. `sender` of
+    padded edges is any row, `receiver` is N.
+    """
+    count = mask.shape[0]
+
+    def settle(state: Int[Array, "N"]) -> Int[Array, "N"]:
+        best = jax.ops.segment_max(
+            state[sender], receiver, count, indices_are_sorted=True
+        )
+        settled = jnp.where(
+            best == KEPT, DROPPED, jnp.where(best < WAITING, KEPT, WAITING)
+        )
+        return jnp.where(state == WAITING, settled, state)
+
+    def waiting(state: Int[Array, "N"]) -> Bool[Array, ""]:
+        return jnp.any(state == WAITING)
+
+    start = jnp.where(mask, jnp.int32(WAITING), jnp.int32(DROPPED))
+    return jax.lax.while_loop(waiting, settle, start) == KEPT
+
+
+def sample_disk(
+    grid: VoxelGrid,
+    position: Float[Array, "N 3"],
+    mask: Bool[Array, "N"],
+    radius: Float[Array, ""],
+    limit: EdgeLimit,
+    *,
+    key: Key[Array, ""],
+) -> tuple[Bool[Array, "N"], Demand]:
+    """Maximal subset with pairwise distance >= radius, greedy in random order.
+
+    The parallel Poisson disk sampling of the paper's section "3D Step". `grid` holds
+    the same points. If the demand exceeds the limit the subset is not valid.
+    """
+    lot = draw_lots(position.shape[0], key=key)
+    edges = radius_edges(
+        grid, position, mask, radius, limit, lambda s, r: beats(lot, s, r)
+    )
+    return elect(edges.sender, edges.receiver, mask), edges.demand
+
+
+def draw_lots(count: int, *, key: Key[Array, ""]) -> UInt32[Array, "N"]:
+    """The random order of dart throwing: smaller lots first, ties by index."""
+    return jax.random.bits(key, (count,), jnp.uint32)
+
+
+def beats(
+    lot: UInt32[Array | np.ndarray, "N"],
+    first: Int[Array | np.ndarray, "E"],
+    second: Int[Array | np.ndarray, "E"],
+) -> Bool[Array | np.ndarray, "E"]:
+    """Whether point `first` is thrown before point `second`."""
+    tie = (lot[first] == lot[second]) & (first < second)
+    return (lot[first] < lot[second]) | tie
+
+
+def build_level(
+    grid: VoxelGrid,
+    position: Float[Array, "N 3"],
+    normal: Float[Array, "N 3"],
+    mask: Bool[Array, "N"],
+    radius: Float[Array, ""],
+    limit: LevelLimit,
+    *,
+    key: Key[Array, ""],
+) -> tuple[Level, LevelDemand]:
+    """One Poisson disk step; rows beyond the kept ones are zero and masked out."""
+    kept, search = sample_disk(grid, position, mask, radius, limit.search, key=key)
+    index, real, points = compact(kept, limit.points)
+    level = Level(
+        jnp.where(real[:, None], position[index], 0.0),
+        jnp.where(real[:, None], normal[index], 0.0),
+        index,
+        real,
+    )
+    return level, LevelDemand(search, points)
+
+
+def poisson_disk(
+    points: Float[np.ndarray, "N 3"], radius: float, *, key: Key[Array, ""]
+) -> Int[np.ndarray, "K"]:
+    """Host-level Poisson disk sampling: ascending indices of the points kept.
+
+    Distances are exact in float64 and no capacity is needed.
+
+    Raises:
+        InputError: points not [N, 3] or not finite, or a radius that is not positive.
+    """
+    receiver, sender = find_neighbors(points, points, radius)
+    count = len(points)
+    rows = bucket(count)
+    # The first `count` lots are the same for any number; so few shapes are compiled.
+    better = beats(np.asarray(draw_lots(rows, key=key)), sender, receiver)
+    edges = bucket(int(better.sum()))
+    padding = (0, edges - int(better.sum()))
+    kept = _elect(
+        np.pad(sender[better], padding),
+        np.pad(receiver[better], padding, constant_values=rows),
+        np.arange(rows) < count,
+    )
+    return np.flatnonzero(kept).astype(np.int32)
+
+
+_elect = jax.jit(elect)

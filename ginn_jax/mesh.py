@@ -1,0 +1,250 @@
+"""Triangles to surface samples: loading, the unit box, the ground, sampling.
+
+Geometry is computed in float64 and returned in float32; units as `fit_unit_box` says.
+"""
+
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+from trimesh.exchange.load import mesh_formats
+
+from ginn_jax import orientation
+from ginn_jax.errors import InputError, InputWarning
+
+
+class Mesh(NamedTuple):
+    """Triangles with one material index a face: 0 is the object, 1 the ground."""
+
+    vertices: Float[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F 3"]
+    material: Int[np.ndarray, "F"]
+
+
+class Samples(NamedTuple):
+    """Points on surfaces with unit normals and the material index of their face."""
+
+    position: Float[np.ndarray, "N 3"]
+    normal: Float[np.ndarray, "N 3"]
+    material: Int[np.ndarray, "N"]
+
+
+def make_mesh(
+    vertices: np.ndarray, faces: np.ndarray, material: np.ndarray | None = None
+) -> Mesh:
+    """A clean `Mesh` from vertices [V 3], faces [F 3] and materials [F] (default 0).
+
+    Degenerate faces (area below 1e-12 of the longest side squared) and vertices that no
+    face uses are dropped, and closed parts that are inside out are turned (see
+    `orientation`); an `InputWarning` counts the dropped and the turned. Raises
+    `InputError` for wrong shapes, an empty or all-degenerate mesh, coordinates that are
+    not finite in float32, and indices out of range.
+    """
+    vertices, faces, material = _checked_arrays(vertices, faces, material)
+    corners = vertices[faces].astype(np.float64)
+    area = np.linalg.norm(_area_vectors(corners), axis=1)
+    solid = area > 1e-12 * np.ptp(corners.reshape(-1, 3), axis=0).max() ** 2
+    if not solid.any():
+        raise InputError("mesh: all faces have zero area; give triangles with an area")
+    if dropped := int((~solid).sum()):
+        _warn(f"dropped {dropped} of {len(faces)} faces: they have zero area")
+    faces, turned = orientation.turn_outward(vertices, faces[solid])
+    if turned:
+        _warn(f"turned {turned} closed part(s) that were inside out")
+    used, faces = np.unique(faces, return_inverse=True)
+    faces = faces.reshape(-1, 3).astype(np.int32)
+    return Mesh(vertices[used], faces, material[solid])
+
+
+def load_mesh(path: str | Path) -> Mesh:
+    """The triangles of any file trimesh reads, cleaned by `make_mesh`.
+
+    All parts of a scene are merged into one mesh, each with its transform applied.
+    Raises `InputError` where the file is missing, unreadable or has no triangles.
+    """
+    scene = _load_scene(Path(path))
+    merged = scene.to_mesh()
+    if not isinstance(merged, trimesh.Trimesh) or len(merged.faces) == 0:
+        if any(isinstance(g, trimesh.PointCloud) for g in scene.geometry.values()):
+            raise InputError(f"{path}: a point cloud, no triangles; use load_points")
+        raise InputError(f"{path}: no triangles in it; the file is empty or corrupt")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", InputWarning)
+        try:
+            mesh = make_mesh(merged.vertices, merged.faces)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+    for warning in caught:
+        _warn(f"{path}: {warning.message}")
+    return mesh
+
+
+def load_points(path: str | Path) -> Samples:
+    """A PLY point cloud with normals (nx, ny, nz) as samples of material 0.
+
+    Normals are normalised. Raises `InputError` where the file is missing, unreadable,
+    a mesh, without normals, or holds non-finite values or zero normals.
+    """
+    clouds = list(_load_scene(Path(path)).geometry.values())
+    if any(isinstance(cloud, trimesh.Trimesh) for cloud in clouds):
+        raise InputError(f"{path}: a mesh, not a point cloud; use load_mesh")
+    if len(clouds) != 1 or "_ply_raw" not in clouds[0].metadata:
+        raise InputError(f"{path}: no PLY point cloud in it; save the points as PLY")
+    columns = clouds[0].metadata["_ply_raw"]["vertex"]["data"]
+    position = np.asarray(clouds[0].vertices, np.float32)
+    try:
+        normal = np.stack([np.ravel(columns[axis]) for axis in ("nx", "ny", "nz")], -1)
+    except (KeyError, ValueError):
+        raise InputError(
+            f"{path}: the points have no normals; estimate them and save nx, ny, nz"
+        ) from None
+    length = np.linalg.norm(normal.astype(np.float64), axis=1, keepdims=True)
+    usable = np.isfinite(position).all(1) & np.isfinite(length[:, 0])
+    if bad := int((~usable | (length[:, 0] == 0)).sum()):
+        raise InputError(
+            f"{path}: {bad} points have a non-finite value or a zero normal; drop them"
+        )
+    material = np.zeros(len(position), np.int32)
+    return Samples(position, (normal / length).astype(np.float32), material)
+
+
+def find_meshes(path: str | Path) -> list[Path]:
+    """The mesh files in a folder and the folders below it, sorted; or the one file.
+
+    Raises `InputError` where there is no such file or folder, or no mesh file in it.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder; give one with meshes")
+    if path.is_file():
+        return [path]
+    endings = {f".{name}" for name in mesh_formats()}
+    found = sorted(p for p in path.rglob("*") if p.suffix.lower() in endings)
+    if not found:
+        raise InputError(f"{path}: no mesh in this folder; put .ply, .obj, .glb there")
+    return found
+
+
+def fit_unit_box(mesh: Mesh) -> Mesh:
+    """The mesh moved and scaled: longest side 1, centred at the origin.
+
+    Call it before `add_ground`. Raises `InputError` where the mesh has no extent.
+    """
+    return mesh._replace(vertices=_into_unit_box(mesh.vertices))
+
+
+def fit_unit_box_points(samples: Samples) -> Samples:
+    """The point cloud moved and scaled as `fit_unit_box` does; normals stay."""
+    return samples._replace(position=_into_unit_box(samples.position))
+
+
+def add_ground(mesh: Mesh, half_extent: float = 0.8) -> Mesh:
+    """The mesh and, at its lowest vertex, a square of material 1 facing +y.
+
+    The square is centred at x = z = 0; `half_extent` is half its side.
+    """
+    low, h = mesh.vertices[:, 1].min(), half_extent
+    square = [[-h, low, -h], [-h, low, h], [h, low, h], [h, low, -h]]
+    faces = np.array([[0, 1, 2], [0, 2, 3]]) + len(mesh.vertices)
+    return Mesh(
+        np.concatenate([mesh.vertices, square]).astype(np.float32),
+        np.concatenate([mesh.faces, faces]).astype(np.int32),
+        np.concatenate([mesh.material, [1, 1]]).astype(np.int32),
+    )
+
+
+def sample_surface(mesh: Mesh, count: int, *, seed: int) -> Samples:
+    """`count` points uniform by area, with the normals and materials of their faces."""
+    shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    position, face = trimesh.sample.sample_surface(shape, count, seed=seed)[:2]
+    normal = _area_vectors(mesh.vertices[mesh.faces[face]].astype(np.float64))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return Samples(
+        np.asarray(position, np.float32),
+        normal.astype(np.float32),
+        mesh.material[face].astype(np.int32),
+    )
+
+
+def add_ground_samples(
+    samples: Samples, half_extent: float = 0.8, *, seed: int
+) -> Samples:
+    """The cloud and samples of a ground as in `add_ground`, as dense as the cloud.
+
+    The cloud's density is 8 / (pi d^2), d the median distance to the 8th neighbour.
+    Raises `InputError` for fewer than 9 points, or where most points coincide.
+    """
+    if len(samples.position) < 9:
+        raise InputError("point cloud: fewer than 9 points; give a denser one")
+    distance = KDTree(samples.position).query(samples.position, 9)[0][:, -1]
+    if (spacing := float(np.median(distance))) == 0:
+        raise InputError("point cloud: most points coincide; remove the duplicates")
+    count = round(8 / (np.pi * spacing**2) * (2 * half_extent) ** 2)
+    place = np.random.default_rng(seed).uniform(-half_extent, half_extent, (count, 3))
+    place[:, 1] = samples.position[:, 1].min()
+    up = np.tile(np.array([0, 1, 0], np.float32), (count, 1))
+    return Samples(
+        np.concatenate([samples.position, place.astype(np.float32)]),
+        np.concatenate([samples.normal, up]),
+        np.concatenate([samples.material, np.ones(count, np.int32)]),
+    )
+
+
+def _checked_arrays(vertices, faces, material):
+    """float32 vertices, int64 faces and int32 materials that belong together."""
+    vertices, faces = np.asarray(vertices), np.asarray(faces)
+    if vertices.size == 0 or faces.size == 0:
+        raise InputError("mesh: empty; give at least one triangle")
+    if (
+        vertices.shape[1:] != (3,)
+        or faces.shape[1:] != (3,)
+        or faces.dtype.kind not in "iu"
+    ):
+        raise InputError(
+            "mesh: wrong shape; give vertices [V 3] and integer faces [F 3]"
+        )
+    with np.errstate(over="ignore"):
+        vertices = vertices.astype(np.float32)
+    if bad := int((~np.isfinite(vertices).all(1)).sum()):
+        raise InputError(f"mesh: {bad} vertices are not finite; remove them")
+    faces = faces.astype(np.int64)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputError(
+            f"mesh: a face index is outside 0..{len(vertices) - 1}; mend it"
+        )
+    material = np.zeros(len(faces)) if material is None else np.asarray(material)
+    if material.shape != (len(faces),):
+        raise InputError(f"mesh: give one material a face, {len(faces)} in all")
+    return vertices, faces, material.astype(np.int32)
+
+
+def _load_scene(path: Path) -> trimesh.Scene:
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give the path of a mesh")
+    try:
+        return trimesh.load_scene(path, process=False)
+    except Exception as error:  # trimesh lets each reader raise what it likes
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path}: cannot be read ({reason}); export it anew") from None
+
+
+def _into_unit_box(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+    points = points.astype(np.float64)
+    low, high = points.min(axis=0), points.max(axis=0)
+    if not (extent := (high - low).max()) > 0:
+        raise InputError("object: all points coincide; give one with an extent")
+    return ((points - (low + high) / 2) / extent).astype(np.float32)
+
+
+def _area_vectors(corners: Float[np.ndarray, "F 3 3"]) -> Float[np.ndarray, "F 3"]:
+    """Normals whose length is the area of their triangle."""
+    edges = corners[:, 1:] - corners[:, :1]
+    return np.cross(edges[:, 0], edges[:, 1]) / 2
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, InputWarning, stacklevel=3)

@@ -1,0 +1,140 @@
+"""How far an image or a shaded cloud is from its reference, on the host in float64.
+
+Two conventions hold throughout. An optional `mask` restricts a number to the pixels
+or points where it is True. Images are linear until `tone_map`; `dssim` takes
+tone-mapped ones.
+"""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from skimage.metrics import structural_similarity
+
+from ginn_jax.errors import InputError
+
+GAMMA = 1.6
+PERCENTILE = 90
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709, linear RGB
+# SSIM as in Wang et al. 2004: Gaussian window, 11 wide; K1 = .01, K2 = .03, range 1.
+SSIM_SIGMA, SSIM_WINDOW = 1.5, 11
+
+Image = Float[np.ndarray, "..."]
+Mask = Bool[np.ndarray, "..."]
+
+
+def mse(a: Image, b: Image, mask: Mask | None = None) -> float:
+    """Mean squared difference of two equal shapes, channels counted alike.
+
+    `mask` has the leading axes of `a`: [H W] for [H W] or [H W C], [N] for a cloud.
+    Raises `InputError` for unequal shapes or nothing to average.
+    """
+    a, b = _pair(a, b)
+    difference = (a - b) ** 2
+    return float(_kept(difference, mask).mean())
+
+
+def true_mse(
+    prediction: Image, target: Image, variance: Image, mask: Mask | None = None
+) -> float:
+    """MSE against what a noisy target estimates: `mse` less the noise floor.
+
+    `variance` is the Monte Carlo variance of `target` (`reference.Estimate.variance`)
+    of the same shape. Unbiased when the noise is independent of the prediction, thus
+    it may come out slightly negative.
+    """
+    target, variance = _pair(target, variance)
+    return mse(prediction, target, mask) - float(_kept(variance, mask).mean())
+
+
+def relative_mse(
+    prediction: Image, target: Image, variance: Image, mask: Mask | None = None
+) -> float:
+    """`true_mse` over the variance of the target, both with the noise subtracted.
+
+    0 is perfect; predicting the mean of the target everywhere scores 1. To pool
+    several clouds, concatenate them. Raises `InputError` where the target is constant.
+    """
+    target, variance = _pair(target, variance)
+    spread = _kept(target, mask).var() - _kept(variance, mask).mean()
+    if not spread > 0:
+        raise InputError("target is constant up to noise: relative MSE has no scale")
+    return true_mse(prediction, target, variance, mask) / float(spread)
+
+
+def equal_rays(error: float, per_ray_variance: float) -> float:
+    """Rays a pixel at which ray tracing has the MSE `error`: their variance over it.
+
+    `per_ray_variance` is the mean over pixels of the variance of one ray, for AO
+    p(1-p): `rays * estimate.variance.mean()`. Infinite for an error of zero or less.
+    """
+    if not (np.isfinite(error) and per_ray_variance >= 0):
+        raise InputError(f"equal rays of MSE {error}, variance {per_ray_variance}")
+    return float(per_ray_variance) / float(error) if error > 0 else float("inf")
+
+
+def tone_map(image: Image, reference: Image, mask: Mask | None = None) -> Image:
+    """Linear [H W] or [H W 3] to display values in [0, 1], after the paper's appendix.
+
+    Scaled so that the .9 luminance percentile of `reference` (over `mask`) becomes 1,
+    clipped, then raised to 1/1.6. Map both images of a pair with the same reference.
+    A reference that is black there leaves the scale at 1.
+    """
+    image, reference = np.asarray(image, float), np.asarray(reference, float)
+    colour = reference.ndim == 3 and reference.shape[-1] == 3
+    luminance = _kept(reference @ LUMINANCE if colour else reference, mask)
+    white = np.percentile(luminance, PERCENTILE)
+    scaled = image / white if white > 0 else image
+    return np.clip(scaled, 0, 1) ** (1 / GAMMA)
+
+
+def dssim(a: Image, b: Image, mask: Mask | None = None) -> float:
+    """(1 - SSIM) / 2 of two images [H W] or [H W C] in [0, 1]: 0 equal, at most 1.
+
+    Channels are averaged. Without a mask, the average leaves out the 5 pixels at each
+    border, where the window overlaps it (scikit-image's). With one, background is set
+    to 0 in both images and the average is over the mask, borders included.
+    Raises `InputError` for unequal shapes or images under 11 pixels a side.
+    """
+    a, b = _pair(a, b)
+    if a.ndim not in (2, 3) or min(a.shape[:2]) < SSIM_WINDOW:
+        raise InputError(f"image {a.shape}: DSSIM needs [H W] or [H W C], 11 pixels up")
+    _kept(a - b, mask)  # for its checks
+    if mask is not None:
+        keep = mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim))
+        a, b = np.where(keep, a, 0), np.where(keep, b, 0)
+    result: Any = structural_similarity(
+        a,
+        b,
+        data_range=1,
+        channel_axis=2 if a.ndim == 3 else None,
+        gaussian_weights=True,
+        sigma=SSIM_SIGMA,
+        use_sample_covariance=False,
+        full=True,
+    )
+    similarity = result[0] if mask is None else _kept(result[1], mask).mean()
+    return float((1 - similarity) / 2)
+
+
+def _pair(a: Image, b: Image) -> tuple[Image, Image]:
+    """Both in float64 and of one shape."""
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    if a.shape != b.shape:
+        raise InputError(f"shapes {a.shape} and {b.shape} differ: give two equal ones")
+    return a, b
+
+
+def _kept(values: Image, mask: Mask | None) -> Image:
+    """The values where the mask, over their leading axes, is True; finite ones."""
+    if mask is not None:
+        if mask.dtype != bool or mask.shape != values.shape[: mask.ndim]:
+            raise InputError(
+                f"mask {mask.dtype}{mask.shape} does not fit {values.shape}"
+            )
+        values = values[mask]
+    if values.size == 0:
+        raise InputError("nothing to average: the mask or the array is empty")
+    if not np.isfinite(values).all():
+        raise InputError("values to compare are not finite: mend or mask them out")
+    return values

@@ -1,0 +1,36 @@
+"""Two settings of a process that make XLA faster on CPU; call before any JAX work."""
+
+import ctypes
+import os
+
+import jax
+
+# glibc's mallopt parameters, from malloc.h.
+TRIM_THRESHOLD, TOP_PAD, MMAP_MAX, ARENA_MAX = -1, -2, -4, -8
+
+
+def tune_process(devices: int | None = None) -> None:
+    """Keep freed memory, and make every core a JAX device.
+
+    XLA allocates its scratch memory anew for each call; glibc returns blocks that large
+    to the kernel, so each call pays a page fault for every 4 KiB it touches: a
+    convolution's gradient runs two to three times faster with the memory kept. Sorting,
+    scattering and prefix sums use one core; with a device per core a batch is shared
+    between them. Where neither applies (no glibc, a GPU) nothing happens.
+    """
+    try:
+        libc = ctypes.CDLL(None)
+        libc.mallopt(MMAP_MAX, 0)
+        libc.mallopt(TRIM_THRESHOLD, 2**31 - 1)
+        libc.mallopt(TOP_PAD, 64 << 20)
+        libc.mallopt(ARENA_MAX, 1)
+    except (AttributeError, OSError, TypeError):
+        pass
+    jax.config.update("jax_num_cpu_devices", devices or available_cores())
+
+
+def available_cores() -> int:
+    """Cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -1,0 +1,142 @@
+"""What an experiment leaves behind: metrics.json, report.md, figures."""
+
+import importlib.metadata
+import json
+import platform
+import resource
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import matplotlib
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from ginn_jax.process import available_cores
+
+PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "mitsuba", "trimesh")
+matplotlib.use("Agg")
+
+
+def environment() -> dict[str, Any]:
+    """Versions, device and cores: what a number has to be read with."""
+    return {
+        "python": platform.python_version(),
+        "packages": {name: importlib.metadata.version(name) for name in PACKAGES},
+        "device": jax.devices()[0].device_kind,
+        "devices": len(jax.devices()),
+        "processor": processor_name(),
+        "cores": available_cores(),
+    }
+
+
+def processor_name() -> str:
+    """The processor's name where the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    names = [
+        line.split(":")[1].strip() for line in lines if line.startswith("model name")
+    ]
+    return names[0] if names else platform.processor()
+
+
+def peak_memory_gib() -> float:
+    """Largest resident memory of this process and of any of its children so far."""
+    unit = 2**30 if platform.system() == "Darwin" else 2**20
+    usage = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    return max(resource.getrusage(who).ru_maxrss for who in usage) / unit
+
+
+def write_results(folder: Path, metrics: Mapping[str, Any], report: str) -> None:
+    """Write metrics.json and report.md into the folder, making it if need be."""
+    folder.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(metrics, indent=1, default=_plain)
+    (folder / "metrics.json").write_text(text + "\n")
+    (folder / "report.md").write_text(report)
+
+
+def _plain(value: Any) -> Any:
+    """NumPy and JAX numbers as JSON numbers."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+def markdown_table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """A table in Markdown; floats to four significant digits."""
+    lines = [header, ["---"] * len(header), *rows]
+    return (
+        "\n".join("| " + " | ".join(map(_cell, line)) + " |" for line in lines) + "\n"
+    )
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return str(value)
+
+
+def table_of(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> str:
+    """A table of some columns of result rows: {key: heading}; a dash where missing."""
+    cells = [[row.get(key, "-") for key in columns] for row in rows]
+    return markdown_table(list(columns.values()), cells)
+
+
+def draw_curve(path: Path, losses: Float[np.ndarray, "S"], floor: float) -> None:
+    """The training loss of every step, its running median, and the ray noise in it."""
+    figure = Figure(figsize=(6, 3.5), layout="constrained")
+    axes = figure.add_subplot()
+    axes.plot(losses, linewidth=0.4, alpha=0.4, color="tab:blue", label="step")
+    width = max(len(losses) // 60, 1)
+    blocks = losses[: len(losses) // width * width].reshape(-1, width)
+    middle = (np.arange(len(blocks)) + 0.5) * width
+    axes.plot(
+        middle, np.median(blocks, axis=1), color="tab:blue", label="running median"
+    )
+    axes.axhline(floor, color="gray", linestyle=":", label="ray noise")
+    axes.set(xlabel="step", ylabel="MSE", yscale="log")
+    axes.legend()
+    figure.savefig(path, dpi=120)
+
+
+def draw_views(path: Path, views: Sequence[tuple[str, np.ndarray, np.ndarray]]) -> None:
+    """Rows of (title, reference, prediction): both, and their difference."""
+    figure = Figure(figsize=(9.3, 3.1 * len(views)), layout="constrained")
+    grid = np.atleast_2d(figure.subplots(len(views), 3, squeeze=False))
+    for row, (title, reference, prediction) in zip(grid, views, strict=True):
+        panels = (reference, prediction, prediction - reference)
+        names = (f"{title}: reference", "network", "difference (red: too open)")
+        for axes, panel, name in zip(row, panels, names, strict=True):
+            signed = panel is panels[2]
+            low, high = (-0.3, 0.3) if signed else (0.0, 1.0)
+            axes.imshow(panel, cmap="RdBu_r" if signed else "gray", vmin=low, vmax=high)
+            axes.set_title(name, fontsize=8)
+            axes.axis("off")
+    figure.savefig(path, dpi=165)
+
+
+def draw_error_against_time(
+    path: Path, groups: Mapping[str, Sequence[Mapping[str, Any]]]
+) -> None:
+    """2D error against time, log-log: one line a group, one labelled dot a method."""
+    figure = Figure(figsize=(6.5, 4.5), layout="constrained")
+    axes = figure.add_subplot()
+    for name, rows in groups.items():
+        ordered = sorted(rows, key=lambda row: row["seconds"])
+        seconds = [1e3 * row["seconds"] for row in ordered]
+        errors = [max(row["mse_2d"], 1e-7) for row in ordered]
+        axes.plot(seconds, errors, "o-", label=name)
+        for row, x, y in zip(ordered, seconds, errors, strict=True):
+            axes.annotate(
+                row["method"],
+                (x, y),
+                fontsize=7,
+                xytext=(4, 4),
+                textcoords="offset points",
+            )
+    axes.set(xlabel="ms per image", ylabel="2D MSE", xscale="log", yscale="log")
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.savefig(path, dpi=140)

@@ -1,0 +1,299 @@
+"""Training: limits measured once, then one jitted step that does everything.
+
+The step draws rotations, thins the clouds, builds the hierarchy, searches, weighs,
+convolves, differentiates and updates. A batch is shared out between the devices.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.sharding import Mesh as DeviceMesh
+from jax.sharding import NamedSharding, PartitionSpec
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from ginn_jax.architecture import Network
+from ginn_jax.dataset import ShadedPoints, oriented, rotate_about_up, side_by_side
+from ginn_jax.geometry import (
+    Demands,
+    Geometry,
+    Limits,
+    build_geometry,
+    build_query_field,
+    fits,
+)
+from ginn_jax.mcconv import Field, Oriented
+from ginn_jax.neighbors import compact
+from ginn_jax.network import Encoder, Shader, Variables
+
+
+@dataclass(frozen=True)
+class Training:
+    """How to train.
+
+    `points` of every cloud are taken for a step, `queries` of those that Poisson disk
+    sampling leaves over carry the loss. Schedule "cosine" warms up and decays to zero
+    over `steps`; "paper" multiplies the rate by 0.7 every 10 epochs.
+    """
+
+    network: Network
+    steps: int
+    batch_size: int = 2
+    points: int = 16384
+    queries: int = 4096
+    learning_rate: float = 5e-3
+    schedule: str = "cosine"
+    warm_up: int = 100
+    clip_norm: float = 1.0
+    epoch_steps: int = 1
+    seed: int = 0
+
+
+class TrainState(NamedTuple):
+    """Everything that a step changes. `skipped` counts non-finite gradients."""
+
+    variables: Variables
+    optimizer: optax.OptState
+    step: Int[Array, ""]
+    skipped: Int[Array, ""]
+
+
+class StepReport(NamedTuple):
+    """What a step says of itself; `fits` is False where a limit was too small."""
+
+    loss: Float[Array, ""]
+    gradient_norm: Float[Array, ""]
+    fits: Bool[Array, ""]
+    demands: Demands
+
+
+class Example(NamedTuple):
+    """The geometry of a batch's share and the queries that carry the loss."""
+
+    geometry: Geometry
+    attributes: Float[Array, "N C"]
+    field: Field
+    queries: Oriented
+    target: Float[Array, "M"]
+
+
+def make_optimizer(config: Training) -> optax.GradientTransformation:
+    """Adam with clipped gradients and the configured schedule."""
+    if config.schedule == "paper":
+        rate = optax.exponential_decay(
+            config.learning_rate, 10 * config.epoch_steps, 0.7, staircase=True
+        )
+    else:
+        rate = optax.warmup_cosine_decay_schedule(
+            0.0,
+            config.learning_rate,
+            min(config.warm_up, config.steps // 2),
+            config.steps,
+        )
+    return optax.chain(optax.clip_by_global_norm(config.clip_norm), optax.adam(rate))
+
+
+def make_example(
+    config: Training, limits: Limits, batch: ShadedPoints, *, key: Key[Array, ""]
+) -> tuple[Example, Demands]:
+    """Rotate, thin and search a batch; queries are points that thinning left over."""
+    clouds = batch.position.shape[0]
+    turn_key, window_key, disk_key = jax.random.split(key, 3)
+    window = jax.random.randint(window_key, (), 0, batch.position.shape[1])
+    batch = jax.tree.map(
+        lambda a: jnp.roll(a, -window, axis=1)[:, : config.points], batch
+    )
+    batch = jax.vmap(lambda c, k: rotate_about_up(c, key=k))(
+        batch, jax.random.split(turn_key, clouds)
+    )
+    cloud = side_by_side(batch)
+    network = config.network
+    geometry, demands = build_geometry(network, limits, oriented(cloud), key=disk_key)
+    rows, mask = _left_over(geometry, clouds, config.points, config.queries)
+    queries = Oriented(cloud.position[rows], cloud.normal[rows], mask)
+    finest, grid, area = geometry.levels[0], geometry.grid, geometry.area
+    field, more = build_query_field(network, limits, finest, grid, area, queries)
+    attributes = geometry.levels[0].normal
+    return Example(
+        geometry, attributes, field, queries, cloud.target[rows]
+    ), demands | more
+
+
+def _left_over(
+    geometry: Geometry, clouds: int, points: int, queries: int
+) -> tuple[Int[Array, "M"], Bool[Array, "M"]]:
+    """Rows of the first `queries` points of each cloud that are not in level 0."""
+    kept = jnp.zeros(clouds * points, bool)
+    finest = jnp.where(geometry.levels[0].mask, geometry.finest, kept.size)
+    free = ~kept.at[finest].set(True, mode="drop").reshape(clouds, points)
+    rows, mask, _ = jax.vmap(partial(compact, capacity=queries))(free)
+    rows += points * jnp.arange(clouds, dtype=jnp.int32)[:, None]
+    return rows.reshape(-1), mask.reshape(-1)
+
+
+def infer(
+    network: Network,
+    variables: Variables,
+    geometry: Geometry,
+    attributes: Float[Array, "N C"],
+    field: Field,
+    queries: Oriented,
+    train: bool = False,
+) -> tuple[Float[Array, "M"], Variables]:
+    """f_2D after f_3D, and the running moments of batch norm (changed if `train`)."""
+    encoder, shader = Encoder(network, train), Shader(network, train)
+    (codes, moments_3d) = encoder.apply(
+        variables["encoder"], attributes, geometry, mutable=["batch_stats"]
+    )
+    (values, moments_2d) = shader.apply(
+        variables["shader"],
+        codes,
+        queries.normal,
+        queries.mask,
+        field,
+        mutable=["batch_stats"],
+    )
+    return values, {"encoder": moments_3d, "shader": moments_2d}
+
+
+def init_variables(
+    network: Network, example: Example, *, key: Key[Array, ""]
+) -> Variables:
+    """Initial parameters and moments; `example` gives the shapes."""
+    encoder_key, shader_key = jax.random.split(key)
+    codes, encoder = Encoder(network, True).init_with_output(
+        encoder_key, example.attributes, example.geometry
+    )
+    queries = example.queries
+    shader = Shader(network, True).init(
+        shader_key, codes, queries.normal, queries.mask, example.field
+    )
+    return {"encoder": encoder, "shader": shader}
+
+
+def batch_loss(
+    params: Variables, moments: Variables, network: Network, example: Example
+) -> tuple[Float[Array, ""], Variables]:
+    """Mean squared error over the queries, the paper's L2 loss."""
+    variables = {part: params[part] | moments[part] for part in params}
+    queries = example.queries
+    values, moments = infer(
+        network,
+        variables,
+        example.geometry,
+        example.attributes,
+        example.field,
+        queries,
+        train=True,
+    )
+    squared = jnp.where(queries.mask, (values - example.target) ** 2, 0.0)
+    count = jnp.sum(queries.mask, dtype=jnp.float32)
+    return jnp.sum(squared) / jnp.maximum(count, 1.0), moments
+
+
+def split_variables(variables: Variables) -> tuple[Variables, Variables]:
+    """Parameters, which are trained, and moments, which are tracked."""
+    params = {part: {"params": v["params"]} for part, v in variables.items()}
+    moments = {
+        part: {name: v[name] for name in v if name != "params"}
+        for part, v in variables.items()
+    }
+    return params, moments
+
+
+def batch_mesh(batch_size: int) -> DeviceMesh:
+    """As many devices as share a batch evenly."""
+    devices = jax.devices()
+    count = max(n for n in range(1, len(devices) + 1) if batch_size % n == 0)
+    return DeviceMesh(np.array(devices[:count]), ("batch",))
+
+
+def _share_gradient(
+    config: Training,
+    limits: Limits,
+    params: Variables,
+    moments: Variables,
+    key: Key[Array, ""],
+    batch: ShadedPoints,
+) -> tuple[Variables, Variables, Array, Demands]:
+    """Gradient, moments, loss and demands, averaged or maximised over the devices."""
+    key = jax.random.fold_in(key, jax.lax.axis_index("batch"))
+    example, demands = make_example(config, limits, batch, key=key)
+    example = jax.lax.optimization_barrier(example)
+    (loss, moments), gradient = jax.value_and_grad(batch_loss, has_aux=True)(
+        params, moments, config.network, example
+    )
+    mean = partial(jax.lax.pmean, axis_name="batch")
+    gradient, moments, loss = jax.tree.map(mean, (gradient, moments, loss))
+    return gradient, moments, loss, jax.lax.pmax(demands, "batch")
+
+
+@partial(jax.jit, static_argnums=(0, 1), donate_argnums=2)
+def train_step(
+    config: Training, limits: Limits, state: TrainState, batch: ShadedPoints
+) -> tuple[TrainState, StepReport]:
+    """One step on a batch [B, N]; the randomness is that of the seed and the step.
+
+    Where a demand exceeds its limit the state comes back untouched. Where the gradient
+    is not finite only `step` and `skipped` advance.
+    """
+    key = jax.random.fold_in(jax.random.key(config.seed), state.step)
+    params, moments = split_variables(state.variables)
+    replicated, shared = PartitionSpec(), PartitionSpec("batch")
+    gradient, new_moments, loss, demands = jax.shard_map(
+        partial(_share_gradient, config, limits),
+        mesh=batch_mesh(config.batch_size),
+        in_specs=(replicated, replicated, replicated, shared),
+        out_specs=replicated,
+        check_vma=False,
+    )(params, moments, key, batch)
+    norm = optax.global_norm(gradient)
+    finite, fitting = jnp.isfinite(norm) & jnp.isfinite(loss), fits(limits, demands)
+    update, optimizer = make_optimizer(config).update(gradient, state.optimizer, params)
+    trained = optax.apply_updates(params, update)
+    fresh = {part: trained[part] | new_moments[part] for part in trained}
+    usable = finite & fitting
+    variables, optimizer = jax.tree.map(
+        lambda new, old: jnp.where(usable, new, old),
+        (fresh, optimizer),
+        (state.variables, state.optimizer),
+    )
+    step = state.step + fitting
+    skipped = state.skipped + (fitting & ~finite)
+    report = StepReport(loss, norm, fitting, demands)
+    return TrainState(variables, optimizer, step, skipped), report
+
+
+def init_state(config: Training, limits: Limits, batch: ShadedPoints) -> TrainState:
+    """The state before the first step; only the shapes of `batch` matter."""
+    key = jax.random.key(config.seed)
+    example = jax.eval_shape(
+        lambda b: make_example(config, limits, b, key=key)[0], batch
+    )
+    zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), example)
+    variables = jax.jit(partial(init_variables, config.network))(zeros, key=key)
+    params, _ = split_variables(variables)
+    optimizer = make_optimizer(config).init(params)
+    return place(config, TrainState(variables, optimizer, jnp.int32(0), jnp.int32(0)))
+
+
+def place(config: Training, state: TrainState) -> TrainState:
+    """The state on every device that shares a batch, as the step returns it."""
+    everywhere = NamedSharding(batch_mesh(config.batch_size), PartitionSpec())
+    return jax.device_put(state, everywhere)
+
+
+def probe_step(
+    config: Training, limits: Limits, share: ShadedPoints, *, key: Any
+) -> Demands:
+    """Demands of one device's share of a batch."""
+    return _probe(config, limits, share, key)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _probe(config: Training, limits: Limits, share: ShadedPoints, key: Any) -> Demands:
+    return make_example(config, limits, share, key=key)[1]

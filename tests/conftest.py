@@ -1,0 +1,24 @@
+"""Every test runs with the library's annotations checked and no silent promotion."""
+
+import os
+
+import jax
+import pytest
+from hypothesis import settings
+from jaxtyping import config, install_import_hook
+
+install_import_hook("ginn_jax", "beartype.beartype")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+settings.register_profile(
+    "ginn_jax", deadline=None, max_examples=25, derandomize="CI" in os.environ
+)
+settings.load_profile("ginn_jax")
+
+
+@pytest.fixture
+def unchecked():
+    """No annotation is checked: wrong input meets the library as a user's would."""
+    config.update("jaxtyping_disable", True)
+    yield
+    config.update("jaxtyping_disable", False)

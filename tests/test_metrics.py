@@ -1,0 +1,168 @@
+"""Metrics against hand-written loops and hand-computed numbers."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from jaxtyping import TypeCheckError
+
+from ginn_jax import metrics
+from ginn_jax.errors import InputError
+
+unit = st.floats(0, 1, width=32, allow_subnormal=False)
+images = arrays(np.float32, (12, 13), elements=unit)
+
+
+def ssim_loop(a, b, row, column):
+    """SSIM at one pixel, written from the definition (Wang et al. 2004)."""
+    total = weight_sum = ma = mb = 0.0
+    window = []
+    for dy in range(-5, 6):
+        for dx in range(-5, 6):
+            w = math.exp(-(dx * dx + dy * dy) / (2 * 1.5**2))
+            window.append(
+                (w, float(a[row + dy, column + dx]), float(b[row + dy, column + dx]))
+            )
+            weight_sum += w
+    window = [(w / weight_sum, x, y) for w, x, y in window]
+    for w, x, y in window:
+        ma += w * x
+        mb += w * y
+    va = sum(w * (x - ma) ** 2 for w, x, _ in window)
+    vb = sum(w * (y - mb) ** 2 for w, _, y in window)
+    total = sum(w * (x - ma) * (y - mb) for w, x, y in window)
+    c1, c2 = 0.01**2, 0.03**2
+    luminance = (2 * ma * mb + c1) / (ma**2 + mb**2 + c1)
+    return luminance * (2 * total + c2) / (va + vb + c2)
+
+
+def noisy_pair(shape, seed=0):
+    rng = np.random.default_rng(seed)
+    a = rng.uniform(0, 1, shape)
+    return a, np.clip(a + rng.normal(0, 0.2, shape), 0, 1)
+
+
+def test_dssim_equals_the_definition():
+    a, b = noisy_pair((17, 15))
+    inner = [ssim_loop(a, b, i, j) for i in range(5, 12) for j in range(5, 10)]
+    assert metrics.dssim(a, b) == pytest.approx((1 - np.mean(inner)) / 2, abs=1e-9)
+
+
+def test_masked_dssim_equals_the_definition_on_black_background():
+    a, b = noisy_pair((17, 15))
+    mask = np.zeros((17, 15), bool)
+    mask[6:10, 5:9] = True
+    black = [np.where(mask, image, 0) for image in (a, b)]
+    inner = [ssim_loop(*black, i, j) for i, j in np.argwhere(mask)]
+    expected = (1 - np.mean(inner)) / 2
+    assert metrics.dssim(a, b, mask) == pytest.approx(expected, abs=1e-9)
+
+
+def test_dssim_averages_channels():
+    a, b = noisy_pair((14, 16, 3))
+    each = [metrics.dssim(a[..., c], b[..., c]) for c in range(3)]
+    assert metrics.dssim(a, b) == pytest.approx(np.mean(each), abs=1e-12)
+    mask = a[..., 0] > 0.4
+    each = [metrics.dssim(a[..., c], b[..., c], mask) for c in range(3)]
+    assert metrics.dssim(a, b, mask) == pytest.approx(np.mean(each), abs=1e-12)
+
+
+@settings(deadline=None)
+@given(images, images)
+def test_dssim_is_symmetric_bounded_and_zero_only_for_equal(a, b):
+    assert metrics.dssim(a, a) == pytest.approx(0, abs=1e-12)
+    assert metrics.dssim(a, b) == pytest.approx(metrics.dssim(b, a), abs=1e-12)
+    assert -1e-12 <= metrics.dssim(a, b) <= 1
+
+
+@settings(deadline=None)
+@given(images, images, arrays(bool, (12, 13)))
+def test_mse_is_a_loop_over_the_mask(a, b, mask):
+    kept = [(float(a[i]) - float(b[i])) ** 2 for i in np.ndindex(12, 13) if mask[i]]
+    if kept:
+        expected = math.fsum(kept) / len(kept)
+        assert metrics.mse(a, b, mask) == pytest.approx(expected, rel=1e-9)
+        assert metrics.mse(a, b, mask) == metrics.mse(b, a, mask)
+    else:
+        with pytest.raises(InputError, match="nothing to average"):
+            metrics.mse(a, b, mask)
+
+
+def test_mse_counts_channels_alike_and_ignores_what_the_mask_hides():
+    a, b = np.zeros((2, 2, 3)), np.zeros((2, 2, 3))
+    b[0, 0], b[1, 1] = (3, 0, 0), np.nan
+    mask = np.array([[True, True], [True, False]])
+    assert metrics.mse(a, b, mask) == 1
+    with pytest.raises(InputError, match="finite"):
+        metrics.mse(a, b)
+
+
+def test_noise_floor_is_subtracted():
+    """A prediction wrong by .1 everywhere, against a target with known noise."""
+    rng = np.random.default_rng(1)
+    truth = rng.uniform(0, 1, 200_000)
+    target, noise = truth + rng.normal(0, 0.3, truth.shape), np.full(truth.shape, 0.09)
+    assert metrics.mse(truth + 0.1, target) == pytest.approx(0.1, rel=0.02)
+    assert metrics.true_mse(truth + 0.1, target, noise) == pytest.approx(0.01, abs=2e-3)
+    relative = metrics.relative_mse(np.full(truth.shape, 0.5), target, noise)
+    assert relative == pytest.approx(1, rel=0.05)
+    with pytest.raises(InputError, match="constant"):
+        metrics.relative_mse(truth, np.ones(truth.shape), noise)
+
+
+def test_equal_rays_inverts_the_error_of_ray_tracing():
+    rng = np.random.default_rng(2)
+    p = rng.uniform(0, 1, 100_000)
+    error = metrics.mse(rng.binomial(20, p) / 20, p)
+    rays = metrics.equal_rays(error, float((p * (1 - p)).mean()))
+    assert rays == pytest.approx(20, rel=0.03)
+    assert metrics.equal_rays(0.0, 0.1) == math.inf
+    with pytest.raises(InputError):
+        metrics.equal_rays(math.nan, 0.1)
+
+
+def test_tone_map_by_hand():
+    reference = np.arange(11.0).reshape(1, 11)  # .9 percentile: 9
+    shown = metrics.tone_map(np.array([[0, 4.5, 9, 20]]), reference)
+    np.testing.assert_allclose(shown, [[0, 0.5 ** (1 / 1.6), 1, 1]])
+    mask = reference < 6  # .9 percentile of 0..5: 4.5
+    np.testing.assert_allclose(metrics.tone_map(reference, reference, mask)[0, 5], 1)
+    colour = np.zeros((1, 11, 3))
+    colour[..., 1] = reference  # luminance .7152 of green
+    green = metrics.tone_map(colour, colour)[0, 3, 1]
+    assert green == pytest.approx((3 / (9 * 0.7152)) ** (1 / 1.6))
+    np.testing.assert_array_equal(metrics.tone_map(reference * 0, reference * 0), 0)
+
+
+@settings(deadline=None)
+@given(images, st.floats(0.01, 100))
+def test_tone_map_ignores_exposure_and_stays_in_range(image, exposure):
+    bright = image.astype(np.float64) * exposure
+    shown = metrics.tone_map(bright, bright)
+    assert shown.min() >= 0
+    assert shown.max() <= 1
+    if np.percentile(image, 90) > 0:
+        np.testing.assert_allclose(shown, metrics.tone_map(image, image), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "mask"),
+    [
+        (np.zeros((12, 12)), np.zeros((12, 13)), None),
+        (np.zeros((12, 12)), np.zeros((12, 12)), np.ones((12, 11), bool)),
+        (np.zeros((12, 12)), np.zeros((12, 12)), np.ones((12, 12))),
+        (np.zeros((12, 12)), np.full((12, 12), np.nan), None),
+    ],
+)
+def test_what_does_not_fit_is_refused(a, b, mask):
+    for metric in (metrics.mse, metrics.dssim):
+        with pytest.raises((InputError, TypeCheckError)):
+            metric(a, b, mask)
+
+
+def test_dssim_refuses_small_images():
+    with pytest.raises(InputError, match="11 pixels"):
+        metrics.dssim(np.zeros((10, 20)), np.zeros((10, 20)))

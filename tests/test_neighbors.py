@@ -1,0 +1,279 @@
+"""Radius search against a double loop, and the promises about capacities."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from oracles import neighbors
+from scipy.spatial import cKDTree
+from strategies import ALL_PAIRS, POINTS, QUERIES, RADII, Cloud, clouds, pad, padded
+
+from ginn_jax import neighbors as nb
+from ginn_jax.errors import InputError
+
+INT32_MAX = 2**31 - 1
+
+
+def found(points, queries, radius):
+    receiver, sender = nb.find_neighbors(points, queries, radius)
+    assert receiver.dtype == sender.dtype == np.int32
+    assert (np.diff(receiver) >= 0).all()
+    pairs = list(zip(receiver.tolist(), sender.tolist(), strict=True))
+    assert len(set(pairs)) == len(pairs)
+    return sorted(pairs)
+
+
+make_grid = jax.jit(nb.build_grid)
+search = jax.jit(nb.radius_edges, static_argnames=("limit", "pair_filter"))
+
+
+def edges_of(points, queries, radius, limit=ALL_PAIRS, reach=None, pair_filter=None):
+    """Edges as NumPy arrays; the grid is made for `reach`, the radius if not given."""
+    grid = make_grid(*points, np.float32(reach or radius))
+    edges = search(grid, *queries, np.float32(radius), limit, pair_filter)
+    return jax.tree.map(np.asarray, edges)
+
+
+def pairs_of(edges, queries):
+    """(query, point) of the real edges, which are sorted, unique, and padded right."""
+    sender, receiver, _ = edges
+    count = min(int(edges.demand.edges), len(receiver))
+    assert (receiver[count:] == len(queries.mask)).all()
+    assert (sender[count:] == 0).all()
+    assert (np.diff(receiver) >= 0).all()
+    pairs = list(zip(receiver[:count].tolist(), sender[:count].tolist(), strict=True))
+    assert len(set(pairs)) == len(pairs)
+    return set(pairs)
+
+
+def sandwich(points, queries, radius):
+    """The pairs that float32 must find, and those that it may find."""
+    (p, point_row), (q, query_row) = points.real(), queries.real()
+    radius = float(np.float32(radius))
+    return [
+        {(query_row[i], point_row[j]) for i, j in neighbors(p, q, radius * slack)}
+        for slack in (1 - 1e-6, 1 + 1e-6)
+    ]
+
+
+@given(clouds(), clouds(), RADII)
+def test_host_search_equals_brute_force(points, queries, radius):
+    points, queries = points.astype(np.float64), queries.astype(np.float64)
+    assert found(points, queries, radius) == neighbors(points, queries, radius)
+
+
+@given(
+    hnp.arrays(np.float64, (12, 3), elements=st.integers(-5, 5).map(lambda k: k * 0.1)),
+    st.sampled_from([0.1, 0.2, 0.3]),
+    st.sampled_from([0.0, 1e4]),
+)
+def test_host_search_is_exact_at_the_radius(cloud, radius, shift):
+    """Distances that differ from the radius by one rounding of float64, or by none."""
+    cloud = cloud + shift
+    assert found(cloud, cloud, radius) == neighbors(cloud, cloud, radius)
+
+
+def test_host_search_accepts_float32_points():
+    cloud = np.random.default_rng(0).random((40, 3), np.float32)
+    assert found(cloud, cloud, 0.3) == neighbors(cloud, cloud, 0.3)
+
+
+def test_host_search_takes_queries_in_blocks(monkeypatch):
+    """Blocks smaller than the queries and the candidates change nothing."""
+    cloud = np.random.default_rng(1).random((120, 3))
+    monkeypatch.setattr(nb, "QUERY_BLOCK", 60)
+    monkeypatch.setattr(nb, "CANDIDATE_BLOCK", 128)
+    expected = neighbors(cloud, cloud, 0.3)
+    assert len(expected) > 3 * 128
+    assert found(cloud, cloud, 0.3) == expected
+
+
+def test_host_search_equals_kd_tree():
+    rng = np.random.default_rng(2)
+    points, queries = rng.normal(size=(1500, 3)), rng.normal(size=(2500, 3))
+    lists = cKDTree(points).query_ball_point(queries, 0.3)
+    expected = [(i, j) for i, row in enumerate(lists) for j in sorted(row)]
+    assert len(expected) > 9000
+    assert found(points, queries, 0.3) == expected
+
+
+@pytest.mark.parametrize("points", [0, 1])
+@pytest.mark.parametrize("queries", [0, 1])
+def test_host_search_of_nothing_finds_nothing(points, queries):
+    pairs = found(np.zeros((points, 3)), np.zeros((queries, 3)), 0.5)
+    assert pairs == [(0, 0)] * (points * queries)
+
+
+@pytest.mark.parametrize("radius", [0.0, -1.0, np.nan, np.inf])
+def test_bad_radius_is_one_line(radius):
+    cloud = np.zeros((2, 3))
+    with pytest.raises(InputError, match=r"^radius is [^\n]*\Z"):
+        nb.find_neighbors(cloud, cloud, radius)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("shape", [(3,), (4, 2), (4, 4), (2, 2, 3), ()])
+def test_bad_shape_is_one_line(shape):
+    good, bad = np.zeros((2, 3)), np.zeros(shape)
+    with pytest.raises(InputError, match=r"^points has shape [^\n]*\Z"):
+        nb.find_neighbors(bad, good, 0.1)
+    with pytest.raises(InputError, match=r"^queries has shape [^\n]*\Z"):
+        nb.find_neighbors(good, bad, 0.1)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_non_finite_coordinate_is_one_line(value):
+    good, bad = np.zeros((2, 3)), np.array([[0, 0, 0], [0, value, 0]])
+    with pytest.raises(InputError, match=r"^points holds non-finite [^\n]*\Z"):
+        nb.find_neighbors(bad, good, 0.1)
+    with pytest.raises(InputError, match=r"^queries holds non-finite [^\n]*\Z"):
+        nb.find_neighbors(good, bad, 0.1)
+
+
+@settings(max_examples=100)
+@given(padded(), padded(QUERIES), RADII)
+def test_jitted_search_equals_brute_force_but_for_rounding(points, queries, radius):
+    edges = edges_of(points, queries, radius)
+    sure, possible = sandwich(points, queries, radius)
+    assert sure <= pairs_of(edges, queries) <= possible
+    assert edges.demand.edges <= edges.demand.candidates <= ALL_PAIRS.candidates
+
+
+@given(padded(), RADII)
+def test_search_of_a_cloud_in_itself_equals_brute_force(points, radius):
+    sure, possible = sandwich(points, points, radius)
+    assert sure <= pairs_of(edges_of(points, points, radius), points) <= possible
+
+
+@given(padded(), padded(QUERIES), st.floats(0.01, 1))
+def test_a_wide_grid_serves_smaller_radii(points, queries, radius):
+    sure, possible = sandwich(points, queries, radius)
+    assert sure <= pairs_of(edges_of(points, queries, radius, reach=1.0), queries)
+    assert pairs_of(edges_of(points, queries, radius, reach=1.0), queries) <= possible
+
+
+def test_search_is_complete_where_cells_had_to_grow():
+    """More columns than the table holds: 1000 radii wide, with neighbours in pairs."""
+    rng = np.random.default_rng(3)
+    first = rng.uniform(-5, 5, (POINTS // 2, 3))
+    step = rng.normal(size=first.shape)
+    second = first + 0.0099 * step / np.linalg.norm(step, axis=1, keepdims=True)
+    points = pad(np.concatenate([first, second]).astype(np.float32), POINTS)
+    sure, possible = sandwich(points, points, 0.01)
+    assert len(sure) >= 2 * POINTS
+    assert sure <= pairs_of(edges_of(points, points, 0.01), points) <= possible
+
+
+@given(padded(), padded(QUERIES), RADII, st.permutations(range(POINTS)))
+def test_permuting_points_permutes_edges(points, queries, radius, order):
+    order = np.array(order)
+    shuffled = Cloud(*(a[order] for a in points))
+    pairs = pairs_of(edges_of(shuffled, queries, radius), queries)
+    assert {(q, order[p]) for q, p in pairs} == pairs_of(
+        edges_of(points, queries, radius), queries
+    )
+
+
+def not_third(sender, receiver):
+    return (sender + receiver) % 3 != 0
+
+
+@given(padded(), padded(QUERIES), RADII)
+def test_a_filter_drops_exactly_its_pairs(points, queries, radius):
+    some = edges_of(points, queries, radius, pair_filter=not_third)
+    kept, pairs = (
+        pairs_of(e, queries) for e in (some, edges_of(points, queries, radius))
+    )
+    assert kept == {(q, p) for q, p in pairs if (q + p) % 3 != 0}
+
+
+@pytest.fixture(scope="module")
+def dense():
+    """A cloud whose search needs fewer candidates than there are pairs."""
+    rng = np.random.default_rng(4)
+    points = pad(rng.random((POINTS, 3)).astype(np.float32), POINTS)
+    need = edges_of(points, points, 0.4).demand
+    assert POINTS < need.edges < need.candidates < ALL_PAIRS.candidates
+    return points, need
+
+
+def test_limits_that_are_just_enough_lose_nothing(dense):
+    points, need = dense
+    limit = nb.EdgeLimit(int(need.candidates), int(need.edges))
+    edges = edges_of(points, points, 0.4, limit)
+    assert edges.demand == need
+    full = edges_of(points, points, 0.4)
+    assert pairs_of(edges, points) == pairs_of(full, points)
+
+
+def test_too_few_edges_are_told_exactly(dense):
+    points, need = dense
+    edges = int(need.edges) - 1
+    short = edges_of(points, points, 0.4, nb.EdgeLimit(ALL_PAIRS.candidates, edges))
+    assert short.demand == need
+    full = pairs_of(edges_of(points, points, 0.4), points)
+    assert len(pairs_of(short, points) & full) == edges
+
+
+def test_too_few_candidates_are_told_exactly(dense):
+    points, need = dense
+    limit = nb.EdgeLimit(int(need.candidates) - 1, ALL_PAIRS.edges)
+    short = edges_of(points, points, 0.4, limit)
+    assert short.demand.candidates == need.candidates
+    assert short.demand.edges <= need.edges
+    assert pairs_of(short, points) <= pairs_of(edges_of(points, points, 0.4), points)
+
+
+@pytest.mark.parametrize("total", [INT32_MAX - 5000, 2**31, 2**31 + 5, 2**32 + 7])
+def test_demand_saturates_where_int32_would_wrap(total):
+    length = np.full(9, total // 9, np.int64)
+    length[0] += total - length.sum()
+    length = jnp.asarray(length.astype(np.int32))
+    demand = nb.expand_ranges(jnp.zeros(9, jnp.int32), length, 64)[1]
+    assert int(demand) == min(total, INT32_MAX)
+
+
+def test_search_tells_of_more_candidates_than_int32_counts():
+    """66,000 points in one place looked up from each of 66,000 queries."""
+    points = pad(np.zeros((66_000, 3), np.float32), 66_000)
+    edges = edges_of(points, points, 0.1, nb.EdgeLimit(64, 64))
+    assert int(edges.demand.candidates) == INT32_MAX
+
+
+expand = jax.jit(nb.expand_ranges, static_argnames="capacity")
+squeeze = jax.jit(nb.compact, static_argnames="capacity")
+
+
+@given(st.lists(st.integers(0, 6), min_size=8, max_size=8), st.integers(0, 30))
+def test_ranges_are_listed_in_order_from_any_slot_on(lengths, first):
+    starts = 100 * np.arange(len(lengths), dtype=np.int32)
+    rows = [
+        (i, s + k)
+        for i, (s, n) in enumerate(zip(starts, lengths, strict=True))
+        for k in range(n)
+    ]
+    slots, total = jax.tree.map(
+        np.asarray, expand(starts, np.array(lengths, np.int32), 16, np.int32(first))
+    )
+    wanted = rows[first : first + 16]
+    listed = np.stack([slots.owner, slots.row], axis=1)[slots.valid]
+    assert total == len(rows)
+    assert listed.tolist() == [list(row) for row in wanted]
+
+
+@given(hnp.arrays(bool, 20), st.sampled_from([1, 7, 24]))
+def test_compaction_keeps_order_and_counts_all(keep, capacity):
+    index, real, demand = map(np.asarray, squeeze(keep, capacity))
+    assert demand == keep.sum()
+    assert index[real].tolist() == np.flatnonzero(keep)[:capacity].tolist()
+
+
+@given(st.integers(1, 10**6))
+def test_buckets_hold_their_count_and_waste_at_most_half(count):
+    size = nb.bucket(count)
+    assert size >= count
+    assert size <= max(64, 1.5 * count)
+    assert nb.bucket(size) == size

@@ -1,0 +1,319 @@
+"""The table of layers against the authors', and what no prediction may depend on."""
+
+from dataclasses import replace
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tiny
+
+from ginn_jax import train
+from ginn_jax.architecture import (
+    PAPER,
+    QUERY,
+    RELEASED,
+    Conv,
+    Network,
+    compact_network,
+)
+from ginn_jax.geometry import (
+    Geometry,
+    build_geometry,
+    build_query_field,
+    fits,
+    limit_names,
+    uniform_limits,
+)
+from ginn_jax.mcconv import Field, Oriented
+from ginn_jax.network import Encoder, Shader
+
+# From the authors' release: levels, radius, bandwidth, channels, channels with skip,
+# parameters of the kernel for 5 attributes, and of the 1x1 layer before it.
+RELEASED_ROWS = {
+    "conv_1": (0, 0, 0.025, 0.25, 8, 8, 560, 0),
+    "pool_1": (0, 1, 0.05, 0.2, 16, 16, 224, 144),
+    "conv_2": (1, 1, 0.1, 0.25, 16, 32, 224, 272),
+    "pool_2": (1, 2, 0.2, 0.2, 32, 32, 448, 1056),
+    "conv_3": (2, 2, 0.2, 0.25, 32, 64, 448, 1056),
+    "pool_3": (2, 3, 0.4, 0.2, 64, 64, 896, 4160),
+    "conv_4": (3, 3, 1.0, 0.2, 64, 64, 896, 4160),
+    "up_3": (3, 2, 0.4, 0.2, 64, 128, 896, 0),
+    "up_2": (2, 1, 0.2, 0.2, 32, 64, 448, 4128),
+    "up_1": (1, 0, 0.1, 0.2, 16, 24, 224, 1040),
+    "query": (0, QUERY, 0.05, 0.2, 8, 8, 112, 0),
+}
+
+# The paper's kernels, batch norm, density and every kind of layer, in two levels.
+SMALL_PAPER = Network(
+    levels=(0.08, 0.1),
+    encoder=(
+        Conv("conv_1", 0, 0, 0.2, 0.25, 4, "raw", mixes=True),
+        Conv("pool_1", 0, 1, 0.2, 0.2, 8),
+        Conv("conv_2", 1, 1, 0.3, 0.25, 8, skip="pool_1"),
+        Conv("up_1", 1, 0, 0.2, 0.2, 16, "norm", skip="conv_1"),
+    ),
+    query=replace(RELEASED.query, radius=0.2),
+    latent=8,
+    head=8,
+    hidden=8,
+    group=8,
+    oriented=False,
+    density="kde",
+    norm="batch",
+)
+COMPACT = compact_network(k=4, levels=(0.08, 0.1), query_radius=0.2, latent=4)
+ROWS = 320
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _cheap_compiling():
+    with tiny.cheap_compiling():
+        yield
+
+
+def unfilled(network, attributes, query_attributes):
+    """Shapes of all variables, from a geometry that has the right ranks only."""
+    rows, edges = 8, 4
+    level = Oriented(np.zeros((rows, 3), np.float32), np.zeros((rows, 3), np.float32), np.ones(rows, bool))
+    index = np.zeros(edges, np.int32)
+    inputs = np.zeros((edges, 7 if network.oriented else 3), np.float32)
+    field = Field(index, index, inputs, np.zeros(edges, np.float32))
+    fields = {c.name: field for c in network.encoder}
+    geometry = Geometry((level,) * 4, index, fields, None, None)
+
+    def init(key):
+        codes, encoder = Encoder(network, True).init_with_output(
+            key, jnp.zeros((rows, attributes)), geometry
+        )
+        shader = Shader(network, True).init(
+            key, codes, jnp.zeros((rows, query_attributes)), level.mask, field
+        )
+        return encoder, shader
+
+    return jax.eval_shape(init, jax.random.key(0))
+
+
+def size(tree):
+    return sum(leaf.size for leaf in jax.tree.leaves(tree))
+
+
+@pytest.fixture(scope="module")
+def released():
+    """Parameters of the released network for indirect light: 5 inputs, 3 at queries."""
+    encoder, shader = unfilled(RELEASED, 5, 3)
+    return encoder["params"], shader["params"]
+
+
+def test_released_table_is_the_authors():
+    assert RELEASED.levels == (0.01, 0.05, 0.1, 0.2)
+    rows = (*RELEASED.encoder, RELEASED.query)
+    assert [c.name for c in rows] == list(RELEASED_ROWS)
+    for c in rows:
+        expected = RELEASED_ROWS[c.name]
+        assert (c.source, c.target) == expected[:2]
+        assert (c.radius, c.bandwidth) == pytest.approx(expected[2:4])
+    assert [c.name for c in rows if c.mixes] == ["conv_1"]
+    skips = {c.name: c.skip for c in rows if c.skip}
+    assert skips == {
+        "conv_2": "pool_1",
+        "conv_3": "pool_2",
+        "up_3": "conv_3",
+        "up_2": "conv_2",
+        "up_1": "conv_1",
+    }
+
+
+@pytest.mark.parametrize("name", RELEASED_ROWS)
+def test_released_layer_has_the_authors_parameters(released, name):
+    *_, kernel, dense = RELEASED_ROWS[name]
+    layer = released[name == "query"][name]
+    assert size(layer["kernel"]) == kernel
+    assert size(layer.get("Dense_0", {})) == dense
+
+
+def test_released_channels_are_the_authors(released):
+    encoder, shader = released
+    wide = {name: row[5] for name, row in RELEASED_ROWS.items()}
+    before = None
+    for name, layer in encoder.items():
+        if name in wide and "Norm_0" in layer:
+            [scale] = {v.size for v in layer["Norm_0"]["BatchNorm_0"].values()}
+            assert scale == wide[before]
+        before = name if name in wide else before
+    assert encoder["latent"]["kernel"].shape == (24, 8)
+    assert shader["Dense_0"]["kernel"].shape == (11, 8)
+    assert shader["Dense_1"]["kernel"].shape == (8, 1)
+
+
+def test_released_network_is_as_large_as_the_authors(released):
+    encoder, shader = released
+    kernels = [layer["kernel"] for layer in encoder.values() if isinstance(layer.get("kernel"), tuple)]
+    assert size(kernels) + size(shader["query"]["kernel"]) == 5376
+    assert size(released) == 23281
+
+
+def test_paper_differs_in_radii_and_blocks():
+    assert PAPER.levels == (0.01, 0.05, 0.15, 0.5)
+    assert (PAPER.hidden, PAPER.group) == (8, 8)
+    radii = {c.name: c.radius for c in PAPER.encoder}
+    assert radii["pool_3"] == radii["conv_4"] == radii["up_3"] == 1.0
+    assert radii["pool_2"] == radii["conv_3"] == radii["up_2"] == 0.3
+    encoder, _ = unfilled(PAPER, 3, 3)
+    # Blocks 3-8-8-8: 176 parameters for 8 values.
+    assert size(encoder["params"]["conv_1"]["kernel"]) == 3 * 176
+    assert size(encoder["params"]["conv_4"]["kernel"]) == 8 * 176
+
+
+@cache
+def scene():
+    """Points 0.11 apart, so that both levels keep all; the rest are the queries."""
+    points = tiny.sphere_on_plane(2500, 1)
+    kept = np.zeros(0, int)
+    for i, p in enumerate(points.position):
+        if (np.linalg.norm(points.position[kept] - p, axis=1) > 0.11).all():
+            kept = np.append(kept, i)
+    assert 200 < len(kept) < ROWS
+    rest = np.setdiff1d(np.arange(2500), kept)[:200]
+    return points.position[kept], points.normal[kept], points, rest
+
+
+def cloud(order=None, rubbish=0.3):
+    """The scene's points, in an order among themselves and the padding."""
+    position, normal, *_ = scene()
+    spare = ROWS - len(position)
+    position = np.concatenate([position, np.full((spare, 3), rubbish, np.float32)])
+    normal = np.concatenate([normal, np.full((spare, 3), rubbish, np.float32)])
+    mask = np.arange(ROWS) < ROWS - spare
+    order = np.arange(ROWS) if order is None else order
+    return Oriented(position[order], normal[order], mask[order])
+
+
+def queries(isolated=0):
+    """200 points of the scene's; the last `isolated` are moved far away."""
+    *_, points, rest = scene()
+    position = points.position[rest].copy()
+    position[200 - isolated :] += np.float32(50)
+    return Oriented(position, points.normal[rest], np.ones(200, bool))
+
+
+def limits_of(network, factor=1):
+    sizes = {"candidates": 49152, "edges": 12288, "pairs": 196608, "points": ROWS}
+    limits = uniform_limits(network, 0)
+    names = limit_names(network)
+    return type(limits)(tuple((n, int(factor * sizes[n.split(".")[1]])) for n in names))
+
+
+@cache
+def example_of(network, factor):
+    """A compiled function from a cloud and queries to what the network needs."""
+    limits = limits_of(network, factor)
+
+    @jax.jit
+    def build(cloud, queries):
+        geometry, demands = build_geometry(network, limits, cloud, key=jax.random.key(2))
+        field, more = build_query_field(
+            network, limits, geometry.levels[0], geometry.grid, geometry.area, queries
+        )
+        target = jnp.sin(9 * queries.position[:, 0])
+        attributes = geometry.levels[0].normal
+        example = train.Example(geometry, attributes, field, queries, target)
+        return example, demands | more, fits(limits, demands | more)
+
+    def checked(cloud, queries):
+        example, demands, enough = build(cloud, queries)
+        assert enough, demands
+        for level in example.geometry.levels:
+            assert level.mask.sum() == cloud.mask.sum()
+        return example
+
+    return checked
+
+
+@cache
+def initial(network):
+    example = example_of(network, 1)(cloud(), queries())
+    init = jax.jit(partial(train.init_variables, network))
+    return init(example, key=jax.random.key(5))
+
+
+@cache
+def predictor(network):
+    """Predictions of a network at initial parameters, one compilation per shape."""
+
+    @jax.jit
+    def predict(variables, example):
+        geometry, attributes, field, asked, _ = example
+        return train.infer(network, variables, geometry, attributes, field, asked)[0]
+
+    return lambda example: np.array(predict(initial(network), example))
+
+
+@cache
+def gradient_of(network):
+    """Loss, moments and gradient in training, one compilation per shape."""
+    params, moments = train.split_variables(initial(network))
+    value = jax.value_and_grad(train.batch_loss, has_aux=True)
+    compiled = jax.jit(lambda example: value(params, moments, network, example))
+    return compiled
+
+
+def test_gradient_reaches_every_parameter_of_the_papers_layers():
+    (loss, moments), gradient = gradient_of(SMALL_PAPER)(
+        example_of(SMALL_PAPER, 1)(cloud(), queries())
+    )
+    assert np.isfinite(loss)
+    leaves = jax.tree_util.tree_leaves_with_path(gradient)
+    named = {jax.tree_util.keystr(path): np.abs(leaf).max() for path, leaf in leaves}
+    # Batch norm takes away what a bias before it adds.
+    last = "['shader']['params']['Dense_1']['bias']"
+    norms_away = [n for n in named if n.endswith("['bias']") and "BatchNorm" not in n]
+    assert len(norms_away) == 2 + 1 + 2
+    assert all(named[n] > 1e-5 for n in named if n == last or n not in norms_away), named
+    kinds = {kind for kind in ("BatchNorm", "w1", "b3", "Dense") for n in named if kind in n}
+    assert len(kinds) == 4
+    _, before = train.split_variables(initial(SMALL_PAPER))
+    for old, new in zip(jax.tree.leaves(before), jax.tree.leaves(moments), strict=True):
+        assert np.isfinite(new).all()
+        assert not np.array_equal(old, new)
+
+
+def test_padding_changes_nothing_in_training():
+    """Neither loss nor gradient nor running moments, whatever the padding holds."""
+    small = gradient_of(SMALL_PAPER)(example_of(SMALL_PAPER, 1)(cloud(), queries()))
+    large = gradient_of(SMALL_PAPER)(
+        example_of(SMALL_PAPER, 1.5)(cloud(rubbish=-0.7), queries())
+    )
+    for a, b in zip(jax.tree.leaves(small), jax.tree.leaves(large), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5 * max(1, np.abs(a).max()))
+
+
+def test_padding_changes_no_prediction():
+    one = predictor(COMPACT)(example_of(COMPACT, 1)(cloud(), queries()))
+    two = predictor(COMPACT)(example_of(COMPACT, 1.5)(cloud(rubbish=-0.7), queries()))
+    assert one.std() > 1e-3
+    np.testing.assert_allclose(one, two, atol=1e-5)
+
+
+def test_order_of_points_changes_no_prediction():
+    order = np.random.default_rng(0).permutation(ROWS)
+    one = predictor(COMPACT)(example_of(COMPACT, 1)(cloud(), queries()))
+    two = predictor(COMPACT)(example_of(COMPACT, 1)(cloud(order), queries()))
+    np.testing.assert_allclose(one, two, atol=1e-5)
+
+
+def test_isolated_queries_are_finite_and_disturb_no_other():
+    build = example_of(COMPACT, 1)
+    near = predictor(COMPACT)(build(cloud(), queries()))
+    far = predictor(COMPACT)(build(cloud(), queries(isolated=30)))
+    assert np.isfinite(far).all()
+    np.testing.assert_allclose(far[:170], near[:170], atol=1e-6)
+    assert not np.allclose(far[170:], near[170:], atol=1e-3)
+
+
+def test_isolated_queries_leave_the_gradient_finite():
+    build = example_of(SMALL_PAPER, 1)
+    for isolated in (30, 200):
+        result = gradient_of(SMALL_PAPER)(build(cloud(), queries(isolated)))
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(result))

@@ -1,0 +1,136 @@
+import numpy as np
+import pytest
+import tiny
+import trimesh
+
+from ginn_jax import scenes
+from ginn_jax.dataset import load_cloud
+from ginn_jax.errors import InputError
+from ginn_jax.shapes import random_shape
+
+SETTINGS = scenes.Occlusion(points=300, rays=4, radius=0.2)
+
+
+@pytest.fixture(scope="module")
+def sources(tmp_path_factory):
+    """A mesh file of a stretched box far from the origin, and a procedural shape."""
+    path = tmp_path_factory.mktemp("meshes") / "crate.ply"
+    box = trimesh.creation.box((1.0, 4.0, 2.0))
+    box.apply_translation([7, 8, 9]).export(path)
+    return scenes.file_sources([path]) + scenes.procedural_sources(1, 5)
+
+
+@pytest.fixture(scope="module")
+def made(sources, tmp_path_factory):
+    """The clouds of both, made in this process."""
+    folder = tmp_path_factory.mktemp("clouds")
+    for source in sources:
+        scenes.make_cloud(source, SETTINGS, scenes.cloud_path(folder, source))
+    return folder
+
+
+def contents(folder):
+    """Bytes and time of each file."""
+    return {p.name: (p.read_bytes(), p.stat().st_mtime_ns) for p in folder.iterdir()}
+
+
+def test_object_fills_its_unit_box_on_the_ground(sources):
+    for source in sources:
+        mesh = scenes.load_object(source)
+        thing = mesh.vertices[np.unique(mesh.faces[mesh.material == 0])]
+        ground = mesh.vertices[np.unique(mesh.faces[mesh.material == 1])]
+        np.testing.assert_allclose(np.ptp(thing, axis=0).max(), 1, atol=1e-5)
+        np.testing.assert_allclose(ground[:, 1], thing[:, 1].min(), atol=1e-5)
+        assert (ground.min(axis=0)[[0, 2]] < thing.min(axis=0)[[0, 2]]).all()
+        assert (ground.max(axis=0)[[0, 2]] > thing.max(axis=0)[[0, 2]]).all()
+    crate = scenes.load_object(sources[0])
+    sides = np.ptp(crate.vertices[np.unique(crate.faces[crate.material == 0])], axis=0)
+    np.testing.assert_allclose(sides, [0.25, 1, 0.5], atol=1e-5)
+
+
+def test_sources_have_names_and_seeds_of_their_own(tmp_path):
+    shapes = scenes.procedural_sources(3, 40)
+    assert [s.seed for s in shapes] == [40, 41, 42]
+    assert len({s.name for s in shapes}) == 3
+    assert all(s.path is None for s in shapes)
+    one = scenes.load_object(shapes[0])
+    np.testing.assert_array_equal(
+        one.faces[one.material == 0].shape, random_shape(40).faces.shape
+    )
+    files = scenes.file_sources([tmp_path / "a.ply", tmp_path / "b.obj"])
+    assert [s.name for s in files] == ["a", "b"]
+
+
+def test_cloud_has_samples_of_the_scene(sources, made):
+    for cloud in scenes.read_clouds(sources, SETTINGS, made):
+        assert cloud.position.shape == (300, 3)
+        np.testing.assert_allclose(np.linalg.norm(cloud.normal, axis=1), 1, atol=1e-5)
+        assert 0 <= cloud.target.min() < 0.9
+        assert 0.5 < cloud.target.max() <= 1
+        assert (cloud.variance >= 0).all()
+        assert len(np.unique(cloud.position, axis=0)) == 300
+
+
+def test_second_making_is_the_same(sources, made, tmp_path):
+    path = scenes.cloud_path(tmp_path, sources[1])
+    scenes.make_cloud(sources[1], SETTINGS, path)
+    assert tiny.identical(load_cloud(path), load_cloud(made / path.name))
+
+
+def test_cached_cloud_is_not_written_again(sources, made, monkeypatch):
+    before = contents(made)
+    monkeypatch.setattr(scenes, "load_object", None)
+    for source in sources:
+        scenes.make_cloud(source, SETTINGS, scenes.cloud_path(made, source))
+    assert contents(made) == before
+
+
+@pytest.mark.parametrize("damage", ["truncated", "other settings"])
+def test_unusable_cached_cloud_is_made_again(sources, made, tmp_path, damage):
+    source = sources[1]
+    path = scenes.cloud_path(tmp_path, source)
+    if damage == "truncated":
+        path.write_bytes((made / path.name).read_bytes()[:500])
+    else:
+        fewer = scenes.Occlusion(points=20, rays=2, radius=0.2)
+        scenes.make_cloud(source, fewer, path)
+        assert len(load_cloud(path).target) == 20
+    scenes.make_cloud(source, SETTINGS, path)
+    assert tiny.identical(load_cloud(path), load_cloud(made / path.name))
+
+
+def test_changed_mesh_file_is_another_origin(tmp_path):
+    path = tmp_path / "thing.ply"
+    trimesh.creation.box((1, 1, 1)).export(path)
+    [source] = scenes.file_sources([path])
+    before = scenes.cloud_origin(source, SETTINGS)
+    assert scenes.cloud_origin(source, SETTINGS) == before
+    trimesh.creation.box((1, 1, 2)).export(path)
+    assert scenes.cloud_origin(source, SETTINGS) != before
+
+
+def test_workers_make_the_same_and_keep_what_is_done(sources, made, tmp_path):
+    done = list(scenes.make_clouds(sources, SETTINGS, tmp_path / "new", 2))
+    assert sorted(done) == sorted((tmp_path / "new").iterdir())
+    assert len(done) == 2
+    for path in done:
+        assert tiny.identical(load_cloud(path), load_cloud(made / path.name))
+    before = contents(tmp_path / "new")
+    broken = tmp_path / "broken.ply"
+    broken.write_text("ply\nnot really")
+    more = [*sources, *scenes.file_sources([broken])]
+    with pytest.raises(InputError, match=r"^[^\n]*broken\.ply[^\n]*$"):
+        list(scenes.make_clouds(more, SETTINGS, tmp_path / "new", 1))
+    assert contents(tmp_path / "new") == before
+
+
+def test_missing_mesh_is_refused(tmp_path):
+    [source] = scenes.file_sources([tmp_path / "gone.ply"])
+    with pytest.raises(InputError, match=r"^[^\n]*gone\.ply[^\n]*$"):
+        scenes.make_cloud(source, SETTINGS, tmp_path / "gone.npz")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_clouds_are_refused(sources, tmp_path):
+    with pytest.raises(InputError, match="crate"):
+        scenes.read_clouds(sources, SETTINGS, tmp_path)

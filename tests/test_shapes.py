@@ -1,0 +1,139 @@
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from experiments.shape_sheet import contact_sheet
+from ginn_jax import reference, sdf, shapes, solids
+from ginn_jax.mesh import add_ground, make_mesh, sample_surface
+
+SEED = st.integers(0, 2**31 - 1)
+
+
+def assert_closed(mesh):
+    """Each edge, by position, is run through as often one way as the other."""
+    _, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    faces, balance = place.ravel()[mesh.faces].tolist(), {}
+    for a, b, c in faces:
+        for start, end in ((a, b), (b, c), (c, a)):
+            edge = (min(start, end), max(start, end))
+            balance[edge] = balance.get(edge, 0) + (1 if start < end else -1)
+    assert not any(balance.values())
+
+
+def signed_volume(vertices, faces):
+    return np.linalg.det(np.asarray(vertices, float)[faces]).sum() / 6
+
+
+def check_shape(mesh):
+    assert_closed(mesh)
+    assert signed_volume(mesh.vertices, mesh.faces) > 1e-4
+    assert len(mesh.faces) <= shapes.MOST_FACES
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    assert (high - low).max() == pytest.approx(1, abs=1e-5)
+    np.testing.assert_allclose(low, -high, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", shapes.FAMILIES)
+def test_each_family_is_closed_and_faces_outward(name):
+    for seed in range(3):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # nothing was dropped or turned
+            check_shape(shapes.shape_of(name, np.random.default_rng(seed)))
+
+
+@pytest.mark.parametrize("name", shapes.FAMILIES)
+def test_most_of_each_family_is_seen_from_outside(name):
+    seen = []
+    for seed in range(3):
+        mesh = add_ground(shapes.shape_of(name, np.random.default_rng(seed)))
+        points = sample_surface(mesh, 1000, seed=0)
+        shade = reference.ambient_occlusion(
+            mesh, points.position, points.normal, 10.0, rays=32, seed=0
+        )
+        seen.append((shade.mean > 0).mean())
+    assert np.mean(seen) > 0.6
+
+
+@settings(max_examples=10, deadline=None)
+@given(SEED)
+def test_random_shapes_are_valid_and_deterministic(seed):
+    first, again = shapes.random_shape(seed), shapes.random_shape(seed)
+    check_shape(first)
+    for one, other in zip(first, again, strict=True):
+        np.testing.assert_array_equal(one, other)
+    other = shapes.random_shape(seed + 1)
+    assert first.vertices.shape != other.vertices.shape or not np.array_equal(
+        first.vertices, other.vertices
+    )
+
+
+def test_every_family_is_drawn(monkeypatch):
+    drawn = set()
+    mesh = make_mesh(np.eye(3), np.array([[0, 1, 2]]))
+    monkeypatch.setattr(shapes, "shape_of", lambda name, _: drawn.add(name) or mesh)
+    for seed in range(300):
+        shapes.random_shape(seed)
+    assert drawn == set(shapes.FAMILIES)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.floats(0.2, 0.8), st.floats(0.2, 0.8))
+def test_marching_cubes_gives_the_volume_of_the_solid(a, b):
+    half = np.array([a, b, 0.5])
+    place = np.array([0.05, -0.1, 0.1])
+    ball = sdf.to_solid(sdf.field_of([sdf.Part(sdf.ellipsoid(half), 0.9, place)]))
+    volume = signed_volume(ball.vertices, ball.faces)
+    assert volume == pytest.approx(4 / 3 * np.pi * half.prod(), rel=0.05)
+    block = sdf.to_solid(sdf.field_of([sdf.Part(sdf.box(half), 1.3, place)]))
+    volume = signed_volume(block.vertices, block.faces)
+    assert volume == pytest.approx(8 * half.prod(), rel=0.05)
+
+
+def test_marching_cubes_gives_one_piece_without_hidden_hollows():
+    def ball(radius, x, cut=False):
+        round_ = sdf.ellipsoid(np.full(3, radius))
+        return sdf.Part(round_, radius, np.array([x, 0.1, 0.0]), cut=cut)
+
+    alone = sdf.to_solid(sdf.field_of([ball(0.5, -0.4)]))
+    hollow = ball(0.3, -0.4, cut=True)
+    same = sdf.to_solid(sdf.field_of([ball(0.2, 0.6), ball(0.5, -0.4), hollow]))
+    assert len(same.split()) == 1
+    assert same.volume == pytest.approx(alone.volume, rel=1e-3)
+    assert len(sdf.to_solid(sdf.field_of([])).faces) == 0
+
+
+def test_contact_sheet_holds_every_shape():
+    sheet = contact_sheet(range(8), 24)
+    assert sheet.shape == (48, 144)
+    for row in (0, 24):
+        for column in range(0, 144, 24):
+            cell = sheet[row : row + 24, column : column + 24]
+            assert (cell.min() < 200) == (row == 0 or column < 48)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.lists(st.floats(0.1, 1), min_size=2, max_size=6),
+    st.integers(1, 8),
+    st.floats(0.05, 0.2),
+)
+def test_solids_have_the_volume_they_should(radii, sections, thin):
+    height = np.arange(len(radii)) * 0.5
+    body = solids.turned(solids.profile(radii, height), 6 * sections)
+    sector = 6 * sections * np.sin(2 * np.pi / (6 * sections)) / 2
+    r, s = np.array(radii[:-1]), np.array(radii[1:])
+    frusta = sector * 0.5 / 3 * (r**2 + r * s + s**2).sum()
+    assert signed_volume(body.vertices, body.faces) == pytest.approx(frusta, rel=1e-4)
+    flat = solids.sheet(lambda x, z: 0.3 * x * z, thin)
+    assert signed_volume(flat.vertices, flat.faces) == pytest.approx(4 * thin, rel=1e-6)
+    angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
+    ring = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], -1)
+    octagon = 2 * 2**0.5 * thin**2
+    for closed, length in ((True, 2 * np.pi), (False, 2 * np.pi * 199 / 200)):
+        tube = solids.tube(ring, thin, closed=closed)
+        volume = signed_volume(tube.vertices, tube.faces)
+        assert volume == pytest.approx(octagon * length, rel=0.02)
+        assert_closed(make_mesh(tube.vertices, tube.faces))

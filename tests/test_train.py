@@ -1,0 +1,266 @@
+"""One tiny scene is learned, by the one step that is compiled for all of this file."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+import tiny
+
+from ginn_jax import train
+from ginn_jax.architecture import compact_network
+from ginn_jax.geometry import Geometry, exceeded, uniform_limits
+from ginn_jax.mcconv import Oriented
+
+
+ONE_LEVEL = compact_network(k=2, levels=(0.08,), query_radius=0.16, latent=2)
+ONE_LEVEL_LIMITS = uniform_limits(ONE_LEVEL, 32768)
+
+
+def run(state, steps, data=None):
+    """The state after some steps, and the report of each."""
+    reports = []
+    for _ in range(steps):
+        state, report = tiny.step(state, tiny.batch() if data is None else data)
+        reports.append(report)
+    return state, reports
+
+
+@pytest.fixture(scope="module")
+def trained():
+    """The state after all steps of the configuration, as NumPy, and the losses."""
+    state, reports = run(tiny.fresh_state(), tiny.CONFIG.steps)
+    assert all(r.fits for r in reports)
+    return jax.tree.map(np.array, state), np.array([r.loss for r in reports])
+
+
+def test_tiny_scene_is_overfitted(trained):
+    state, losses = trained
+    variance = tiny.batch().target.var()
+    assert losses[0] > 0.5 * variance
+    assert losses[-20:].mean() < 0.1 * variance
+    assert state.step == tiny.CONFIG.steps
+    assert state.skipped == 0
+
+
+def test_gradient_reaches_every_parameter():
+    state, [report] = run(tiny.fresh_state(), 1)
+    first_moments = optax.tree.get(state.optimizer, "mu")
+    leaves = jax.tree_util.tree_leaves_with_path(first_moments)
+    dead = [jax.tree_util.keystr(path) for path, leaf in leaves if not np.any(leaf)]
+    params, _ = train.split_variables(state.variables)
+    assert len(leaves) == len(jax.tree.leaves(params)) > 40
+    assert dead == []
+    assert report.gradient_norm > 0
+
+
+def test_step_compiles_once(trained):
+    run(tiny.fresh_state(), 1)
+    compiled = train.train_step._cache_size()
+    run(tiny.fresh_state(), 2, tiny.batch(5))
+    run(train.place(tiny.CONFIG, trained[0]), 2)
+    assert train.train_step._cache_size() == compiled
+
+
+def test_seed_and_step_decide_everything():
+    one, first = run(tiny.fresh_state(), 3)
+    two, second = run(tiny.fresh_state(), 3)
+    assert tiny.identical((one, first), (two, second))
+
+
+def test_other_step_draws_otherwise():
+    later = tiny.fresh_state()._replace(step=jnp.int32(7))
+    _, [now] = run(tiny.fresh_state(), 1)
+    _, [then] = run(train.place(tiny.CONFIG, later), 1)
+    assert now.loss != then.loss
+    assert now.demands["level_0.edges"] != then.demands["level_0.edges"]
+
+
+def test_donated_state_is_not_used_again(trained):
+    state, data = train.place(tiny.CONFIG, trained[0]), tiny.batch()
+    before = jax.tree.map(np.array, data)
+    state, _ = run(state, 2, jax.device_put(data))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.variables))
+    assert tiny.identical(data, before)
+
+
+def test_overflow_leaves_the_state_alone(trained):
+    state = jax.tree.map(np.array, train.place(tiny.CONFIG, trained[0]))
+    crowded = tiny.batch()._replace(position=tiny.batch().position * np.float32(0.3))
+    after, [report] = run(train.place(tiny.CONFIG, state), 1, crowded)
+    assert not report.fits
+    assert tiny.identical(after, state)
+    short = exceeded(tiny.LIMITS, report.demands)
+    assert short["level_0.candidates"] > tiny.LIMITS.of("level_0.candidates")
+    assert "level_1.points" not in short
+    # What follows is as though nothing had happened.
+    again, _ = run(after, 1)
+    unbroken, _ = run(train.place(tiny.CONFIG, state), 1)
+    assert tiny.identical(again, unbroken)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e30])
+def test_non_finite_gradient_is_skipped_and_counted(value):
+    state = jax.tree.map(np.array, tiny.fresh_state())
+    target = tiny.batch().target.copy()
+    target[1] = value
+    after, [report] = run(tiny.fresh_state(), 1, tiny.batch()._replace(target=target))
+    assert report.fits
+    assert not np.isfinite(report.loss)
+    assert tiny.identical(after.variables, state.variables)
+    assert tiny.identical(after.optimizer, state.optimizer)
+    assert (int(after.step), int(after.skipped)) == (1, 1)
+
+
+def check_loss_of_zero_network(config=tiny.CONFIG, limits=tiny.LIMITS):
+    """A network that says 0 has the mean square of the targets for its loss.
+
+    Each cloud has its own constant, so a cloud that is not counted shows, as does one
+    that counts twice.
+    """
+    state = tiny.fresh_state(config, limits)
+    last = state.variables["shader"]["params"]["Dense_1"]
+    assert last["kernel"].shape[1] == 1
+    state.variables["shader"]["params"]["Dense_1"] = jax.tree.map(jnp.zeros_like, last)
+    state = train.place(config, state)
+    target = np.ones_like(tiny.batch().target) * np.array([[1], [3]], np.float32)
+    _, report = tiny.step(state, tiny.batch()._replace(target=target), config, limits)
+    assert report.fits
+    np.testing.assert_allclose(report.loss, (1 + 9) / 2, rtol=1e-6)
+    # That of the last bias alone is 2 * mean(0 - target) = -4.
+    assert 4 < report.gradient_norm < 100
+
+
+def test_loss_is_the_mean_square_error():
+    check_loss_of_zero_network()
+
+
+TWO_DEVICES = """
+import jax
+import numpy as np
+from dataclasses import replace
+from functools import partial
+from ginn_jax import process, train
+process.tune_process(2)
+assert len(jax.devices()) == 2
+assert train.batch_mesh(2).size == train.batch_mesh(4).size == 2
+assert train.batch_mesh(3).size == 1
+import test_train, tiny
+config = replace(tiny.CONFIG, network=test_train.ONE_LEVEL)
+limits = test_train.ONE_LEVEL_LIMITS
+test_train.check_loss_of_zero_network(config, limits)
+state, data = tiny.fresh_state(config, limits), tiny.batch()
+for _ in range(2):
+    state, report = tiny.step(state, data, config, limits)
+shares = [[s.data for s in a.addressable_shards] for a in jax.tree.leaves(state)]
+assert all(len(s) == 2 and tiny.identical(*s) for s in shares)
+assert report.fits and state.step == 2 and train.train_step._cache_size() == 1
+nan = data._replace(target=data.target * np.float32([[1], [np.nan]]))
+state, report = tiny.step(state, nan, config, limits)
+assert state.skipped == 1 and state.step == 3
+crowded = data.position * np.float32([[[1]], [[0.2]]])
+state, report = tiny.step(state, data._replace(position=crowded), config, limits)
+assert not report.fits and state.step == 3
+print("two devices agree")
+"""
+
+
+def test_batch_is_shared_between_devices():
+    here = Path(__file__).parent
+    paths = os.pathsep.join([str(here), str(here.parent), os.environ.get("PYTHONPATH", "")])
+    more = {"PYTHONPATH": paths, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", TWO_DEVICES],
+        env=os.environ | more,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.stdout == "two devices agree\n", done.stderr[-2000:]
+
+
+def rates(config, steps):
+    """The learning rate of each update: with a constant gradient Adam's very step."""
+    optimizer = train.make_optimizer(config)
+    update = jax.jit(optimizer.update)
+    gradient, found = jnp.float32(1), []
+    state = optimizer.init(gradient)
+    with jax.numpy_dtype_promotion("standard"):
+        for _ in range(steps):
+            change, state = update(gradient, state)
+            found.append(-float(change))
+    return np.array(found)
+
+
+def test_paper_schedule():
+    config = replace(
+        tiny.CONFIG, schedule="paper", learning_rate=0.005, epoch_steps=3, steps=600
+    )
+    expected = 0.005 * 0.7 ** (np.arange(95) // 30)
+    np.testing.assert_allclose(rates(config, 95), expected, rtol=1e-4)
+
+
+def test_cosine_schedule_warms_up_and_decays():
+    config = replace(tiny.CONFIG, steps=80, warm_up=20, learning_rate=0.01)
+    found = rates(config, 81)
+    np.testing.assert_allclose(found[:21], 0.01 * np.arange(21) / 20, atol=1e-7)
+    t = np.arange(61) / 60
+    np.testing.assert_allclose(found[20:], 0.005 * (1 + np.cos(np.pi * t)), atol=1e-6)
+
+
+def test_warm_up_fits_into_a_short_run():
+    found = rates(replace(tiny.CONFIG, steps=10, warm_up=100), 11)
+    assert np.argmax(found) == 5
+    assert found[10] < 1e-6
+
+
+def test_gradient_is_clipped():
+    optimizer = train.make_optimizer(tiny.CONFIG)
+    gradient = {"a": jnp.float32(300), "b": jnp.float32(-400)}
+    with jax.numpy_dtype_promotion("standard"):
+        _, state = optimizer.update(gradient, optimizer.init(gradient))
+    clipped = optax.tree.get(state, "mu")
+    np.testing.assert_allclose(clipped["a"], 0.1 * 0.6, rtol=1e-5)
+    np.testing.assert_allclose(clipped["b"], 0.1 * -0.8, rtol=1e-5)
+
+
+def test_left_over_points_carry_the_loss():
+    # Two clouds of 6: level 0 has points 0, 4 and 7; its last rows are padding.
+    mask = np.array([True, True, True, False, False])
+    level = Oriented(np.zeros((5, 3), np.float32), np.zeros((5, 3), np.float32), mask)
+    finest = jnp.array([0, 4, 7, 11, 11], jnp.int32)
+    geometry = Geometry((level,), finest, {}, None, None)
+    left_over = jax.jit(train._left_over, static_argnums=(1, 2, 3))
+    rows, real = left_over(geometry, 2, 6, 3)
+    assert real.all()
+    assert rows.tolist() == [1, 2, 3, 6, 8, 9]
+    rows, real = left_over(geometry, 2, 6, 8)
+    assert rows[:4].tolist() == [1, 2, 3, 5]
+    assert rows[8:13].tolist() == [6, 8, 9, 10, 11]
+    assert real.tolist() == [True] * 4 + [False] * 4 + [True] * 5 + [False] * 3
+
+
+def test_queries_lie_beside_the_finest_level():
+    config = replace(tiny.CONFIG, network=ONE_LEVEL, queries=100)
+    build = partial(train.make_example, config, ONE_LEVEL_LIMITS)
+    with tiny.cheap_compiling():
+        example, _ = jax.jit(build)(tiny.batch(), key=jax.random.key(3))
+    queries, level = example.queries, example.geometry.levels[0]
+    assert queries.mask.sum() == 200
+    position = np.array(queries.position, np.float64)
+    kept = np.array(level.position)[np.array(level.mask)].astype(np.float64)
+    distance = np.linalg.norm(position[:, None] - kept, axis=-1).min(axis=1)
+    assert distance.min() > 0
+    assert distance.max() < 0.08
+    # Each still has its own target, wherever rotation and thinning have put it.
+    centred = position - np.repeat([[0.0, 0, 0], [4, 0, 0]], 100, axis=0)
+    exact = tiny.exact_openness(centred, np.array(queries.normal))
+    np.testing.assert_allclose(example.target, exact, atol=1e-4)

@@ -1,0 +1,105 @@
+"""A network small enough to compile in seconds, and a scene with exact answers.
+
+What takes a compilation is cached by it, so that all test files share it.
+"""
+
+from contextlib import contextmanager
+from functools import cache
+
+import jax
+import numpy as np
+
+from ginn_jax import train
+from ginn_jax.architecture import compact_network
+from ginn_jax.dataset import ShadedPoints, stack_clouds
+from ginn_jax.geometry import Limits, limit_names
+
+NETWORK = compact_network(k=4, levels=(0.08, 0.2), query_radius=0.16, latent=4)
+CONFIG = train.Training(
+    NETWORK,
+    steps=200,
+    batch_size=2,
+    points=1000,
+    queries=128,
+    learning_rate=0.02,
+    warm_up=10,
+)
+
+
+def _capacity(name):
+    if name.endswith(".points"):
+        return {"level_0.points": 1152, "level_1.points": 256}[name]
+    return 28672 if name.endswith(".candidates") else 10240
+
+
+# What `measure_limits` finds for `CONFIG`, rounded up.
+LIMITS = Limits(tuple((name, _capacity(name)) for name in limit_names(NETWORK)))
+
+
+def sphere_on_plane(count, seed):
+    """Points on a sphere of diameter 1 and the plane under it, with their openness.
+
+    The sphere hides R^3 / D^3 of a plane's point at the distance D of its centre; the
+    plane, were it infinite, hides (1 - n_y) / 2 of a sphere's point.
+    """
+    rng = np.random.default_rng(seed)
+    radius, half = 0.5, 0.8
+    upper = count * 11 // 20
+    normal = rng.normal(size=(upper, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    ground = rng.uniform(-half, half, (count - upper, 3)) * [1, 0, 1]
+    up = np.tile([0.0, 1, 0], (count - upper, 1))
+    position = np.concatenate([radius * normal + [0, radius, 0], ground])
+    normal = np.concatenate([normal, up])
+    target = exact_openness(position, normal)
+    order = rng.permutation(count)
+    columns = (position, normal, target, np.zeros(count))
+    return ShadedPoints(*(c[order].astype(np.float32) for c in columns))
+
+
+def exact_openness(position, normal):
+    """What `sphere_on_plane` says of its points, from where they are."""
+    distance = np.maximum(np.linalg.norm(position - [0, 0.5, 0], axis=1), 0.5)
+    on_plane = np.abs(position[:, 1]) < 1e-6
+    return np.where(on_plane, 1 - (0.5 / distance) ** 3, (1 + normal[:, 1]) / 2)
+
+
+@cache
+def batch(first=0):
+    """Two clouds of 1200 points."""
+    return stack_clouds([sphere_on_plane(1200, first + i) for i in range(2)])
+
+
+def step(state, data, config=CONFIG, limits=LIMITS):
+    """`train.train_step`; optax does not run where promotion must be explicit."""
+    with jax.numpy_dtype_promotion("standard"):
+        return train.train_step(config, limits, state, data)
+
+
+def fresh_state(config=CONFIG, limits=LIMITS):
+    """A state before the first step, for the caller to give away."""
+    return train.place(config, _initial_state(config, limits))
+
+
+@cache
+def _initial_state(config, limits):
+    with cheap_compiling():
+        return jax.tree.map(np.array, train.init_state(config, limits, batch()))
+
+
+@contextmanager
+def cheap_compiling():
+    """Compilation at half the time, for what runs a few times only."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_disable_most_optimizations", False)
+
+
+def identical(a, b):
+    """Whether two trees are equal bit for bit."""
+    if jax.tree.structure(a) != jax.tree.structure(b):
+        return False
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return all(np.array(x).tobytes() == np.array(y).tobytes() for x, y in pairs)
