@@ -1,7 +1,7 @@
-"""Benchmarks, one script per question: `python -m benchmarks.NAME [--quick] [--out DIR]`.
+"""Benchmarks, one script per question: `python -m benchmarks.NAME`.
 
-Each writes metrics.json, report.md and a figure. Times are wall times, compilation
-apart, of variants that take turns in one process.
+Each takes --quick and --out DIR, and writes metrics.json, report.md and a figure there.
+Times are wall times, compilation apart, of variants that take turns in one process.
 """
 
 import sys

@@ -184,7 +184,9 @@ def main(options: Options) -> dict[str, Any]:
 
 {options.points} points, {options.queries} queries; median of {options.repeats} calls
 ± half the interquartile range; all searches return the same pairs.
-{describe()} Missing: {", ".join(missing) or "none"}.
+Missing peers: {", ".join(missing) or "none"}.
+
+{describe()}
 
 {table}
 ![times](neighbors.png)

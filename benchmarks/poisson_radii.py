@@ -53,7 +53,6 @@ from ginn_jax.train import Training, init_state
 UNSEEN_SEED = 20_000_000
 ASKED = 4096
 SLACK = 1.1
-KEY = jax.random.key
 # The paper's table TimingPD, AO rows: object, radius -> thousands of points, ms.
 PAPER = {
     ("Elephant", 0.01): (8.6, 203.6),
@@ -63,6 +62,8 @@ PAPER = {
     ("Horse", 0.015): (1.7, 20.5),
     ("Horse", 0.02): (0.9, 15.9),
 }
+
+ERRORS = {"mse_3d": "3D MSE", "mse_2d": "2D MSE", "dssim_2d": "DSSIM"}
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,7 @@ def _demands(
     network: Network, limits: Limits, cloud: Oriented, blocks: Oriented
 ) -> Demands:
     """What f_3D and every block of f_2D need."""
-    geometry, demands = build_geometry(network, limits, cloud, key=KEY(0))
+    geometry, demands = build_geometry(network, limits, cloud, key=jax.random.key(0))
     ends = geometry.levels[0], geometry.grid, geometry.area
     needs = jax.lax.map(
         lambda block: build_query_field(network, limits, *ends, block)[1], blocks
@@ -158,10 +159,11 @@ def _demands(
 
 def tight_limits(network: Network, subject: Subject) -> Limits:
     """Capacities with little to spare for this cloud and these pixels."""
-    given, gbuffer = subject.given, subject.view.gbuffer
+    given, asked, gbuffer = subject.given, subject.asked, subject.view.gbuffer
     cloud = _padded(given.position, given.normal, bucket(len(given.position)))
-    pixels = gbuffer.position[gbuffer.mask], gbuffer.normal[gbuffer.mask]
-    flat = _padded(*pixels, -(-len(pixels[0]) // BLOCK) * BLOCK)
+    position = np.concatenate([gbuffer.position[gbuffer.mask], asked.position])
+    normal = np.concatenate([gbuffer.normal[gbuffer.mask], asked.normal])
+    flat = _padded(position, normal, -(-len(position) // BLOCK) * BLOCK)
     blocks = jax.tree.map(lambda a: a.reshape(-1, BLOCK, *a.shape[1:]), flat)
     names = limit_names(network)
     rows = [1 << (15 if name.endswith("points") else 20) for name in names]
@@ -186,7 +188,9 @@ def evaluate(model: Model, subject: Subject, radius: float) -> tuple[dict, dict]
     arrays = given.position, given.normal
 
     def encode() -> Any:
-        return encode_cloud(network, limits, model.variables, *arrays, key=KEY(0))
+        return encode_cloud(
+            network, limits, model.variables, *arrays, key=jax.random.key(0)
+        )
 
     encoded, used = encode()
     pixels = gbuffer.position, gbuffer.normal, gbuffer.mask
@@ -248,12 +252,13 @@ def main(options: Options) -> dict[str, Any]:
         "paper": [[*where, *what] for where, what in PAPER.items()],
         "options": asdict(options),
         "environment": report.environment() | {"load": load()},
+        "machine": describe(),
         "seconds_compile": sum(row["seconds_compile"] for row in rows),
         "seconds_total": time.perf_counter() - begin,
     }
     text = write_report(metrics)
     report.write_results(options.out, metrics, text)
-    draw(options.out / "poisson_radii.png", rows)
+    draw(options.out / "poisson_radii.png", rows, metrics["trained"])
     print(text)
     return metrics
 
@@ -262,55 +267,61 @@ def write_report(metrics: dict[str, Any]) -> str:
     """report.md: our table beside the paper's."""
     columns = {"object": "object", "radius": "radius", "points": "points"}
     columns |= {"ms_f_3D": "f_3D ms", "ms_f_2D": "f_2D ms", "pixels": "pixels"}
-    columns |= {"mse_3d": "3D MSE", "mse_2d": "2D MSE", "dssim_2d": "DSSIM"}
+    columns |= ERRORS if metrics["trained"] else {}
     ours = report.table_of(metrics["rows"], columns)
     heads = ["object", "radius", "points (k)", "ms"]
     paper, options = report.markdown_table(heads, metrics["paper"]), metrics["options"]
-    network = metrics["network"]
-    weights = f"Weights of {options['run']}."
+    levels = ", ".join(map(str, metrics["network"]["levels"][1:]))
+    weights = f"Weights: {options['run']}."
     if not metrics["trained"]:
-        weights = "**Weights are untrained: times hold, errors mean nothing.**"
+        weights = "**Untrained weights: times hold, errors would mean nothing.**"
     return f"""# Poisson disk radius at test time, ambient occlusion
 
-{weights} Levels {network["levels"]} but for the finest, f_2D radius
-{network["query"]["radius"]}, occlusion radius {metrics["occlusion_radius"]};
-{options["points"]} samples of an object before the disk, {options["resolution"]} x
-{options["resolution"]} image of which the foreground pixels are shaded. Times: median
-of {options["repeats"]} calls, compilation apart, G-buffer not counted. Errors: against
-Mitsuba at {options["rays"]} rays, whose noise is subtracted from the MSE; DSSIM after
-the paper's tone mapping, over the foreground.
-{describe()}
+{weights}
+
+- levels: the radius below, then {levels}; f_2D radius
+  {metrics["network"]["query"]["radius"]}
+- occlusion radius: {metrics["occlusion_radius"]}
+- {options["points"]} samples of an object before the disk; image
+  {options["resolution"]} x {options["resolution"]}, `pixels` of it in the foreground
+- times: median of {options["repeats"]} calls, search included, compilation and
+  G-buffer apart
+- errors: against Mitsuba at {options["rays"]} rays, whose noise is subtracted from the
+  MSE; 3D at {ASKED} points that the network is not given; DSSIM tone-mapped as in the
+  paper, over the foreground
+
+{metrics["machine"]}
 
 {ours}
-The paper's table TimingPD (AO, whole network at 1024 x 1024, GTX 1080), on its objects:
+The paper's table TimingPD: AO, the whole network, 1024 x 1024, NVIDIA GTX 1080:
 
 {paper}
 ![time and error against radius](poisson_radii.png)
 """
 
 
-def draw(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Time and error against the radius, a line for each object and quantity."""
-    figure = Figure(figsize=(11, 3.6), layout="constrained")
-    names = dict.fromkeys(row["object"] for row in rows)
-    panels = {
-        "ms": ("ms_f_3D", "ms_f_2D"),
-        "MSE": ("mse_3d", "mse_2d"),
-        "DSSIM": ("dssim_2d",),
-    }
-    grid = figure.subplots(1, 3)
+def draw(path: Path, rows: list[dict[str, Any]], trained: bool) -> None:
+    """Time and error against the radius: a colour for each object."""
+    panels = {"ms": ("ms_f_3D", "ms_f_2D")}
+    panels |= {"MSE": ("mse_3d", "mse_2d"), "DSSIM": ("dssim_2d",)} if trained else {}
+    figure = Figure(figsize=(5 * len(panels), 4), layout="constrained")
+    grid = figure.subplots(1, len(panels), squeeze=False)[0]
+    objects = list(dict.fromkeys(row["object"] for row in rows))
     for axes, (unit, keys) in zip(grid, panels.items(), strict=True):
-        for i, name in enumerate(names):
+        for i, name in enumerate(objects):
             own = [row for row in rows if row["object"] == name]
+            radii = [row["radius"] for row in own]
             for key, style in zip(keys, ("-o", "--s"), strict=False):
-                radii, values = [r["radius"] for r in own], [r[key] for r in own]
-                axes.plot(radii, values, style, color=f"C{i}", label=f"{name} {key}")
-        axes.set(xlabel="Poisson disk radius", ylabel=unit, ylim=(0, None))
+                values = [row[key] for row in own]
+                axes.plot(radii, values, style, color=f"C{i}", label=f"{name}, {key}")
+        axes.set(xlabel="Poisson disk radius", ylabel=unit)
+    for name, style in (("Elephant", ":^"), ("Horse", ":v")):
+        ends = [(r, ms) for (who, r), (_, ms) in PAPER.items() if who == name]
+        title = f"paper, {name}, GTX 1080"
+        grid[0].plot(*zip(*ends, strict=True), style, color="gray", label=title)
+    for axes in grid:
+        axes.set_ylim(0, None)
         axes.legend(fontsize=6)
-    for name in ("Elephant", "Horse"):
-        points = [(r, ms) for (who, r), (_, ms) in PAPER.items() if who == name]
-        grid[0].plot(*zip(*points, strict=True), ":^", color="gray", label=name)
-        grid[0].annotate(f"paper, {name}, GTX 1080", points[0], fontsize=6)
     figure.savefig(path, dpi=130)
 
 

@@ -67,7 +67,7 @@ class Options:
     repeats: int = 15
     """Timed calls of each stage."""
     quick: bool = False
-    """Small clouds and few repeats: to try things, not for numbers."""
+    """One share of small clouds, few repeats: to try things, not for numbers."""
 
 
 QUICK = {"shapes": 2, "points": 2000, "queries": 256, "repeats": 3}
@@ -138,10 +138,9 @@ def profile(
 ) -> dict[str, Any]:
     """Seconds that each stage adds, and the share of geometry in the whole step."""
     calls = {s: stage_call(config, limits, s, batch) for s in STAGES}
-    report_ = calls["step"]()[1]
-    if not bool(report_.fits):
-        raise InputError("a limit was too small: give more --shapes to measure them on")
     timings = measure(calls, repeats)
+    if not bool(calls["step"]()[1].fits):
+        raise InputError("a limit was too small: measure them on more --shapes")
     return {
         "devices": batch_mesh(config.batch_size).size,
         "batch": config.batch_size,
@@ -164,7 +163,7 @@ def make_batch(options: Options, config: Training) -> tuple[ShadedPoints, Limits
 
 
 def main(options: Options) -> dict[str, Any]:
-    """Profile one device's share and the whole step; returns what metrics.json holds."""
+    """Profile a device's share and the whole step; returns what metrics.json holds."""
     require(options, {"shapes": 1, "batch": 1, "points": 500, "queries": 1})
     require(options, {"repeats": 1})
     begin = time.perf_counter()
@@ -181,7 +180,7 @@ def main(options: Options) -> dict[str, Any]:
     small = jax.tree.map(lambda a: a[:share], batch)
     single = replace(config, batch_size=share)
     columns = {"one device's share": profile(single, limits, small, options.repeats)}
-    if share < config.batch_size:
+    if share < config.batch_size and not options.quick:
         columns["whole step"] = profile(config, limits, batch, options.repeats)
     metrics = {
         "columns": columns,
@@ -190,6 +189,7 @@ def main(options: Options) -> dict[str, Any]:
         "training": asdict(config),
         "options": asdict(options),
         "environment": report.environment() | {"load": load()},
+        "machine": describe(),
         "seconds_total": time.perf_counter() - begin,
     }
     text = write_report(metrics)
@@ -214,8 +214,9 @@ def write_report(metrics: dict[str, Any]) -> str:
     return f"""# Shares of the train step
 
 Preset {options["preset"]}, {options["points"]} points and {options["queries"]} queries
-of each cloud; median of {options["repeats"]} calls (clouds on devices).
-{describe()}
+of each cloud; median of {options["repeats"]} calls; in brackets clouds on devices.
+
+{metrics["machine"]}
 
 {report.markdown_table(["stage", *heads], rows)}
 Poisson disk, search, densities and kernel inputs together take {verdict} a third of

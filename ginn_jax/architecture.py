@@ -81,7 +81,7 @@ def released_table(k: int, radii: tuple[float, ...]) -> tuple[Conv, ...]:
 RELEASED = Network(
     levels=(0.01, 0.05, 0.1, 0.2),
     encoder=released_table(8, (0.05, 0.1, 0.2)),
-    query=Conv("query", 0, QUERY, 0.05, 0.2, 8),
+    query=Conv("query", 0, QUERY, 0.05, 0.2, 8, "raw"),
     latent=8,
     head=8,
     hidden=4,

@@ -78,16 +78,17 @@ def load_run(folder: Path, config: Training, extra: dict[str, Any]) -> Limits:
     path = folder / "run.json"
     try:
         record = json.loads(path.read_text())
-        limits = Limits(tuple((k, int(v)) for k, v in record.pop("limits").items()))
+        training = dict(record["training"])
+        limits = Limits(tuple((k, int(v)) for k, v in record["limits"].items()))
     except FileNotFoundError:
         raise InputError(
             f"{folder} holds no run to resume: leave out --resume"
         ) from None
-    except (ValueError, KeyError, AttributeError):
+    except (ValueError, KeyError, AttributeError, TypeError):
         raise InputError(f"{path} is damaged: delete it and start anew") from None
     wanted = json.loads(json.dumps({"training": asdict(config), **extra}))
     for name in sorted(wanted["training"]):
-        if record.get("training", {}).get(name) != wanted["training"][name]:
+        if training.get(name) != wanted["training"][name]:
             raise InputError(
                 f"{path} was made with another {name}: resume with the same"
             )

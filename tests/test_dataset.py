@@ -18,7 +18,9 @@ def cloud_of(count, seed=0):
     """Random numbers in every field."""
     rng = np.random.default_rng(seed)
     shapes = [(count, 3), (count, 3), (count,), (count,)]
-    return dataset.ShadedPoints(*(rng.normal(size=s).astype(np.float32) for s in shapes))
+    return dataset.ShadedPoints(
+        *(rng.normal(size=s).astype(np.float32) for s in shapes)
+    )
 
 
 @pytest.fixture
@@ -132,15 +134,21 @@ def test_rotation_turns_normals_with_positions(seed):
     # A turn, not a reflection.
     volume = [np.linalg.det(a[:3] - a[3:6]) for a in (p, q)]
     np.testing.assert_allclose(volume[1], volume[0], atol=1e-4)
-    assert tiny.identical((turned.target, turned.variance), (cloud.target, cloud.variance))
+    assert tiny.identical(
+        (turned.target, turned.variance), (cloud.target, cloud.variance)
+    )
 
 
 def test_rotation_reaches_every_azimuth():
     east = dataset.ShadedPoints(
-        np.array([[1, 0, 0]], np.float32), np.array([[1, 0, 0]], np.float32), *cloud_of(1)[2:]
+        np.array([[1, 0, 0]], np.float32),
+        np.array([[1, 0, 0]], np.float32),
+        *cloud_of(1)[2:],
     )
     keys = jax.random.split(jax.random.key(0), 400)
-    x, _, z = jax.vmap(lambda k: dataset.rotate_about_up(east, key=k).position[0])(keys).T
+    x, _, z = jax.vmap(lambda k: dataset.rotate_about_up(east, key=k).position[0])(
+        keys
+    ).T
     counts, _ = np.histogram(np.arctan2(z, x), bins=8, range=(-np.pi, np.pi))
     assert counts.min() > 25
 
@@ -177,7 +185,9 @@ def test_oriented_masks_nothing():
 def test_every_epoch_is_a_permutation(clouds, size):
     orders = [dataset.batch_order(clouds, size, s, seed=4) for s in range(5 * clouds)]
     epochs = np.concatenate(orders).reshape(-1, clouds)
-    np.testing.assert_array_equal(np.sort(epochs), np.tile(np.arange(clouds), (5 * size, 1)))
+    np.testing.assert_array_equal(
+        np.sort(epochs), np.tile(np.arange(clouds), (5 * size, 1))
+    )
     if clouds > 5:
         assert len({tuple(e) for e in epochs}) > 2
 

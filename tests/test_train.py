@@ -19,7 +19,6 @@ from ginn_jax.architecture import compact_network
 from ginn_jax.geometry import Geometry, exceeded, uniform_limits
 from ginn_jax.mcconv import Oriented
 
-
 ONE_LEVEL = compact_network(k=2, levels=(0.08,), query_radius=0.16, latent=2)
 ONE_LEVEL_LIMITS = uniform_limits(ONE_LEVEL, 32768)
 
@@ -99,7 +98,6 @@ def test_overflow_leaves_the_state_alone(trained):
     assert tiny.identical(after, state)
     short = exceeded(tiny.LIMITS, report.demands)
     assert short["level_0.candidates"] > tiny.LIMITS.of("level_0.candidates")
-    assert "level_1.points" not in short
     # What follows is as though nothing had happened.
     again, _ = run(after, 1)
     unbroken, _ = run(train.place(tiny.CONFIG, state), 1)
@@ -174,7 +172,9 @@ print("two devices agree")
 
 def test_batch_is_shared_between_devices():
     here = Path(__file__).parent
-    paths = os.pathsep.join([str(here), str(here.parent), os.environ.get("PYTHONPATH", "")])
+    paths = os.pathsep.join(
+        [str(here), str(here.parent), os.environ.get("PYTHONPATH", "")]
+    )
     more = {"PYTHONPATH": paths, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
     done = subprocess.run(
         [sys.executable, "-c", TWO_DEVICES],

@@ -1,0 +1,145 @@
+"""The benchmarks run and say what they should; how long things take is not tested."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+import tiny
+
+from benchmarks import hasten, neighbors, poisson_radii, timing, train_step
+from ginn_jax import architecture, checkpoint
+from ginn_jax.errors import InputError
+
+
+def test_measure_alternates_and_keeps_order():
+    calls = []
+    variants = {name: lambda name=name: calls.append(name) for name in ("b", "a")}
+    timings = timing.measure(variants, repeats=3)
+    assert calls == ["b", "a"] * 4
+    assert list(timings) == ["b", "a"]
+    assert all(len(t.seconds) == 3 for t in timings.values())
+
+
+def test_timing_of_known_seconds():
+    found = timing.Timing(5.0, (1.0, 3.0, 2.0, 4.0, 9.0))
+    assert (found.median, found.minimum, found.compile) == (3.0, 1.0, 2.0)
+    assert found.spread == pytest.approx(2 / 3)
+    assert json.loads(json.dumps(found.record()))["first"] == 5.0
+
+
+def test_measure_counts_compilation_in_the_first_call_only():
+    traced = []
+
+    @jax.jit
+    def work(x):
+        traced.append(x)
+        return x + 1
+
+    timing.measure({"work": lambda: work(np.float32(1))}, repeats=3)
+    assert len(traced) == 1
+
+
+def test_describe_is_one_line():
+    line = timing.describe()
+    assert "\n" not in line
+    assert jax.__version__ in line
+
+
+def test_quick_keeps_what_the_user_gave():
+    options = neighbors.Options(points=77, quick=True)
+    assert hasten(options, neighbors.QUICK).points == 77
+    assert hasten(options, neighbors.QUICK).queries == neighbors.QUICK["queries"]
+
+
+def test_same_pairs_knows_order_from_difference():
+    some, other = np.array([0, 0, 1]), np.array([2, 1, 0])
+    assert neighbors.same_pairs((some, other), (some[::-1], other[::-1]), 3)
+    assert not neighbors.same_pairs((some, other), (some, np.array([2, 1, 1])), 3)
+    assert not neighbors.same_pairs((some[:2], other[:2]), (some, other), 3)
+    assert not neighbors.same_pairs(*[(np.array([0, 0]), np.array([1, 1]))] * 2, 3)
+
+
+def test_neighbors(tmp_path, monkeypatch):
+    def absent():
+        raise ImportError
+
+    monkeypatch.setitem(neighbors.PEERS, "absent", absent)
+    options = neighbors.Options(
+        tmp_path, points=300, queries=500, radii=(0.1,), repeats=1
+    )
+    metrics = neighbors.main(options)
+    assert metrics["missing"] == ["absent"]
+    assert [case["cloud"] for case in metrics["cases"]] == list(neighbors.CLOUDS)
+    assert all(case["pairs"] > 0 for case in metrics["cases"])
+    check_files(tmp_path, "neighbors.png")
+
+
+def test_neighbors_stops_at_a_search_that_is_wrong(tmp_path, monkeypatch):
+    def wrong(points, queries, radius):
+        return tuple(a[1:] for a in neighbors.find_neighbors(points, queries, radius))
+
+    monkeypatch.setitem(neighbors.PEERS, "wrong", lambda: wrong)
+    options = neighbors.Options(tmp_path, points=200, queries=200, radii=(0.1,))
+    with pytest.raises(AssertionError, match="wrong found other pairs"):
+        neighbors.main(options)
+
+
+def test_train_step(tmp_path, monkeypatch):
+    monkeypatch.setitem(architecture.PRESETS, "default", tiny.NETWORK)
+    monkeypatch.setattr("ginn_jax.fit.PROBES", 2)
+    monkeypatch.setattr("ginn_jax.fit.PROBE_SLACK", 2.0)
+    options = train_step.Options(
+        tmp_path, shapes=1, batch=1, points=600, queries=64, repeats=1
+    )
+    metrics = train_step.main(options)
+    share = metrics["columns"]["one device's share"]
+    assert list(share["added"]) == list(train_step.STAGES)
+    assert sum(share["added"].values()) == pytest.approx(share["seconds"])
+    assert "a third of" in (tmp_path / "report.md").read_text()
+    check_files(tmp_path, "train_step.png")
+
+
+@pytest.mark.parametrize("trained", [False, True])
+def test_poisson_radii(tmp_path, monkeypatch, trained):
+    monkeypatch.setattr(architecture, "DEFAULT", tiny.NETWORK)
+    variables = jax.tree.map(np.asarray, tiny.fresh_state().variables)
+    record = (tiny.NETWORK, tiny.LIMITS, variables)
+    monkeypatch.setattr(checkpoint, "load_weights", lambda _: record, raising=False)
+    (tmp_path / "run.json").write_text('{"occlusion": {"radius": 0.2}}')
+    options = poisson_radii.Options(
+        tmp_path / "out",
+        tmp_path if trained else None,
+        shapes=1,
+        radii=(0.08,),
+        points=1200,
+        resolution=32,
+        rays=4,
+        repeats=1,
+    )
+    metrics = poisson_radii.main(options)
+    assert metrics["occlusion_radius"] == (0.2 if trained else 0.1)
+    assert [row["radius"] for row in metrics["rows"]] == [0.08]
+    assert 0 < metrics["rows"][0]["points"] < 1200
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert ("3D MSE" in text) == trained
+    assert ("Untrained" in text) != trained
+    check_files(tmp_path / "out", "poisson_radii.png")
+
+
+def test_mistakes_are_input_errors(tmp_path, monkeypatch):
+    monkeypatch.setattr(architecture, "DEFAULT", tiny.NETWORK)
+    with pytest.raises(InputError, match="--radii"):
+        neighbors.main(neighbors.Options(tmp_path, radii=(0.1, -1.0)))
+    with pytest.raises(InputError, match="--repeats is 0"):
+        train_step.main(train_step.Options(tmp_path, repeats=0))
+    with pytest.raises(InputError, match="Poisson radius"):
+        poisson_radii.main(poisson_radii.Options(tmp_path, radii=(7.0,)))
+
+
+def check_files(folder, figure):
+    """The three files, and what every metrics.json has."""
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert {"options", "environment", "seconds_total"} <= set(metrics)
+    assert (folder / "report.md").read_text().startswith("# ")
+    assert (folder / figure).stat().st_size > 1000

@@ -1,0 +1,179 @@
+import json
+import shutil
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+import tiny
+
+from ginn_jax import checkpoint
+from ginn_jax.errors import InputError
+
+EXTRA = {"clouds": 12, "rays": 64}
+
+
+def after(state, steps):
+    for _ in range(steps):
+        state, _ = tiny.step(state, tiny.batch())
+    return state
+
+
+def save(folder, *states):
+    """Save states in turn, and wait until they are written."""
+    manager = checkpoint.open_manager(folder)
+    for state in states:
+        checkpoint.save_state(manager, state)
+    manager.close()
+
+
+def restore(folder):
+    manager = checkpoint.open_manager(folder)
+    try:
+        return checkpoint.restore_state(manager, tiny.fresh_state())
+    finally:
+        manager.close()
+
+
+@pytest.fixture(scope="module")
+def third():
+    """The state after three steps, as NumPy."""
+    return jax.tree.map(np.array, after(tiny.fresh_state(), 3))
+
+
+@pytest.fixture(scope="module")
+def saved(third, tmp_path_factory):
+    """A folder with that state."""
+    folder = tmp_path_factory.mktemp("run")
+    save(folder, third)
+    return folder
+
+
+def test_resumed_run_equals_an_unbroken_one(third, saved):
+    resumed = restore(saved)
+    assert tiny.identical(jax.tree.map(np.array, resumed), third)
+    like = tiny.fresh_state()
+    assert jax.tree.map(lambda a: a.sharding, resumed) == jax.tree.map(
+        lambda a: a.sharding, like
+    )
+    resumed, unbroken = after(resumed, 3), after(tiny.fresh_state(), 6)
+    assert tiny.identical(resumed, unbroken)
+    assert resumed.step == 6
+
+
+def test_no_checkpoint_is_none(tmp_path):
+    assert restore(tmp_path) is None
+
+
+def test_newest_two_are_kept_and_the_newest_restored(third, tmp_path):
+    states = [third._replace(step=np.int32(s)) for s in (5, 6, 7, 7)]
+    save(tmp_path, *states)
+    manager = checkpoint.open_manager(tmp_path)
+    assert list(manager.all_steps()) == [6, 7]
+    manager.close()
+    assert restore(tmp_path).step == 7
+
+
+def restore_or_reason(folder):
+    """What is restored and None, or None and why not."""
+    try:
+        return restore(folder), None
+    except InputError as error:
+        return None, str(error)
+
+
+def test_damaged_checkpoint_is_refused(third, saved, tmp_path):
+    """Each file in turn cut to half: one line naming the folder, or no harm done."""
+    files = [p.relative_to(saved) for p in saved.rglob("*") if p.is_file()]
+    refused = 0
+    for number, file in enumerate(sorted(files)):
+        folder = tmp_path / str(number)
+        shutil.copytree(saved, folder)
+        whole = (folder / file).read_bytes()
+        (folder / file).write_bytes(whole[: len(whole) // 2])
+        found, reason = restore_or_reason(folder)
+        if reason is None:
+            assert tiny.identical(jax.tree.map(np.array, found), third), file
+        else:
+            refused += 1
+            assert str(folder / "checkpoints" / "3") in reason
+            assert "\n" not in reason
+    assert refused >= 2
+
+
+def test_checkpoint_of_another_network_is_refused(third, tmp_path):
+    encoder = third.variables["encoder"]
+    less = {k: v for k, v in encoder["params"].items() if k != "conv_0"}
+    other = third.variables | {"encoder": {"params": less}}
+    save(tmp_path, third._replace(variables=other))
+    with pytest.raises(InputError, match=r"^checkpoint [^\n]*checkpoints/3[^\n]*$"):
+        restore(tmp_path)
+
+
+@pytest.fixture
+def recorded(tmp_path):
+    """A folder with the record of a run."""
+    checkpoint.save_run(tmp_path, tiny.CONFIG, tiny.LIMITS, EXTRA)
+    return tmp_path
+
+
+def test_record_comes_back(recorded):
+    limits = checkpoint.load_run(recorded, tiny.CONFIG, EXTRA)
+    assert dict(limits.sizes) == dict(tiny.LIMITS.sizes)
+    assert [p.name for p in recorded.iterdir()] == ["run.json"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"steps": 7},
+        {"batch_size": 4},
+        {"points": 999},
+        {"learning_rate": 0.01},
+        {"schedule": "paper"},
+        {"seed": 1},
+        {"network": replace(tiny.NETWORK, hidden=8)},
+        {"network": replace(tiny.NETWORK, encoder=tiny.NETWORK.encoder[:-1])},
+    ],
+)
+def test_other_configuration_is_refused(recorded, change):
+    [name] = change
+    with pytest.raises(InputError, match=rf"^[^\n]*run\.json[^\n]* {name}\b[^\n]*$"):
+        checkpoint.load_run(recorded, replace(tiny.CONFIG, **change), EXTRA)
+
+
+@pytest.mark.parametrize("extra", [{"clouds": 13, "rays": 64}, EXTRA | {"new": 1}])
+def test_other_data_is_refused(recorded, extra):
+    name = "clouds" if "new" not in extra else "new"
+    with pytest.raises(InputError, match=rf"another {name}\b"):
+        checkpoint.load_run(recorded, tiny.CONFIG, extra)
+
+
+def test_no_record_is_refused(tmp_path):
+    with pytest.raises(InputError, match="no run to resume"):
+        checkpoint.load_run(tmp_path, tiny.CONFIG, EXTRA)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: text[: len(text) // 2],
+        lambda text: "",
+        lambda text: "[1, 2]",
+        lambda text: "3",
+        lambda text: text.replace('"limits"', '"limit"'),
+        lambda text: json.dumps(json.loads(text) | {"limits": {"a": None}}),
+        lambda text: json.dumps(json.loads(text) | {"training": 3}),
+    ],
+)
+def test_damaged_record_is_refused(recorded, damage):
+    path = recorded / "run.json"
+    path.write_text(damage(path.read_text()))
+    with pytest.raises(InputError, match=r"^[^\n]*run\.json[^\n]*$"):
+        checkpoint.load_run(recorded, tiny.CONFIG, EXTRA)
+
+
+def test_undecodable_record_is_refused(recorded):
+    (recorded / "run.json").write_bytes(b"\xff\xfe\x00{")
+    with pytest.raises(InputError, match=r"run\.json is damaged"):
+        checkpoint.load_run(recorded, tiny.CONFIG, EXTRA)

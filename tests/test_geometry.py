@@ -1,0 +1,310 @@
+"""Levels, edges, areas and weights of a small sphere, and every limit in turn."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracles
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ginn_jax import geometry as ge
+from ginn_jax.architecture import PRESETS, Network, compact_network, released_table
+from ginn_jax.mcconv import Oriented
+from ginn_jax.neighbors import Demand, Edges
+
+RADIUS = 0.5
+LEVELS = (0.1, 0.25)
+NETWORKS = {
+    density: compact_network(4, LEVELS, query_radius=0.25, density=density)
+    for density in ("surface", "kde")
+}
+SHALLOW = compact_network(4, (0.25,), query_radius=0.25, density="kde")
+GENEROUS = {"points": 512, "edges": 1 << 14, "candidates": 1 << 15, "pairs": 1 << 16}
+
+
+def sphere(count, seed):
+    normal = np.random.default_rng(seed).normal(size=(count, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = normal.astype(np.float32)
+    return Oriented(np.float32(RADIUS) * normal, normal, np.arange(count) < count - 20)
+
+
+CLOUD, QUERIES = sphere(340, 0), sphere(50, 1)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_compilation():
+    """Most of the time here is XLA's."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+def build(config, limits, cloud, queries):
+    cloud, queries = jax.tree.map(jnp.asarray, (cloud, queries))
+    geometry, demands = ge.build_geometry(config, limits, cloud, key=jax.random.key(2))
+    ends = geometry.levels[0], geometry.grid, geometry.area, queries
+    field, more = ge.build_query_field(config, limits, *ends)
+    return geometry, field, demands | more
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def jitted(config, limits, cloud, queries):
+    return build(config, limits, cloud, queries)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def demands_of(config, limits, cloud, queries):
+    return build(config, limits, cloud, queries)[2]
+
+
+def generous(config):
+    names = ge.limit_names(config)
+    return ge.Limits(tuple((n, GENEROUS[n.split(".")[1]]) for n in names))
+
+
+def as_numpy(tree):
+    return jax.tree.map(np.asarray, tree)
+
+
+def as_jax(demands):
+    return jax.tree.map(jnp.asarray, demands)
+
+
+@pytest.fixture(scope="module", params=NETWORKS)
+def built(request):
+    config = NETWORKS[request.param]
+    return config, *as_numpy(jitted(config, generous(config), CLOUD, QUERIES))
+
+
+@pytest.fixture(scope="module")
+def surface():
+    config = NETWORKS["surface"]
+    return config, *as_numpy(jitted(config, generous(config), CLOUD, QUERIES))
+
+
+def real_rows(points):
+    return np.asarray(points.position, np.float64)[points.mask]
+
+
+def pairs(field, receivers):
+    real = field.receiver < receivers
+    return set(zip(field.receiver[real], field.sender[real], strict=True))
+
+
+def test_every_limit_has_its_demand_and_every_demand_its_limit(built):
+    config, _, _, demands = built
+    assert (
+        set(demands) == set(ge.limit_names(config)) == set(dict(generous(config).sizes))
+    )
+
+
+def test_demands_within_limits_fit(built):
+    config, _, _, demands = built
+    exact = ge.Limits(tuple((name, int(d)) for name, d in demands.items()))
+    for limits in (generous(config), exact):
+        assert ge.fits(limits, as_jax(demands))
+        assert ge.exceeded(limits, as_jax(demands)) == {}
+    for name in demands:
+        short = ge.Limits(tuple((n, c - (n == name)) for n, c in exact.sizes))
+        assert not ge.fits(short, as_jax(demands))
+        assert ge.exceeded(short, as_jax(demands)) == {name: exact.of(name)}
+
+
+def test_levels_are_nested_poisson_disks(built):
+    config, geometry, _, _ = built
+    finest = geometry.finest[geometry.levels[0].mask]
+    cloud = CLOUD
+    np.testing.assert_array_equal(
+        geometry.levels[0].position[geometry.levels[0].mask], cloud.position[finest]
+    )
+    finer = real_rows(cloud)
+    for level, radius in zip(geometry.levels, config.levels, strict=True):
+        points = real_rows(level)
+        assert set(map(tuple, points)) <= set(map(tuple, finer))
+        distance = np.linalg.norm(points[:, None] - points[None], axis=-1)
+        assert distance[np.triu_indices(len(points), 1)].min() >= radius * (1 - 1e-6)
+        reach = np.linalg.norm(finer[:, None] - points[None], axis=-1).min(axis=1)
+        assert reach.max() < radius * (1 + 1e-6)
+        np.testing.assert_array_equal(level.normal, level.position / RADIUS)
+        assert not level.position[~level.mask].any()
+        finer = points
+
+
+def test_fields_hold_the_pairs_of_a_direct_search(built):
+    """Also where the edges of another convolution are turned round."""
+    config, geometry, query_field, _ = built
+    fields = [(geometry.fields[c.name], c) for c in config.encoder]
+    for field, conv in [*fields, (query_field, config.query)]:
+        senders = geometry.levels[conv.source]
+        receivers = QUERIES if conv is config.query else geometry.levels[conv.target]
+        places = np.flatnonzero(receivers.mask)
+        expected = oracles.neighbors(
+            real_rows(senders), receivers.position[places], np.float32(conv.radius)
+        )
+        expected = {(places[q], p) for q, p in expected}
+        assert len(expected) > len(places)
+        assert pairs(field, len(receivers.mask)) == expected
+
+
+def test_inputs_point_from_sender_to_receiver(built):
+    config, geometry, query_field, _ = built
+    fields = [(geometry.fields[c.name], c) for c in config.encoder]
+    for field, conv in [*fields, (query_field, config.query)]:
+        receivers = QUERIES if conv is config.query else geometry.levels[conv.target]
+        real = field.receiver < len(receivers.mask)
+        x = receivers.position[field.receiver[real]]
+        y = geometry.levels[conv.source].position[field.sender[real]]
+        np.testing.assert_allclose(
+            field.inputs[real, :3], (x - y) / np.float32(conv.radius), atol=1e-6
+        )
+        assert not field.inputs[~real].any()
+        assert not field.weight[~real].any()
+        assert (field.weight[real] > 0).all()
+
+
+def test_areas_add_up_to_the_surface(surface):
+    _, geometry, _, _ = surface
+    area, mask = geometry.area, geometry.levels[0].mask
+    assert not area[~mask].any()
+    assert area.sum() == pytest.approx(4 * np.pi * RADIUS**2, rel=0.05)
+
+
+def test_weights_are_areas_relative_to_the_disk(surface):
+    config, geometry, query_field, _ = surface
+    points = real_rows(geometry.levels[0])
+    within = next(c for c in config.encoder if c.source == c.target == 0)
+    area = [oracles.quartic_area(p, points, within.radius) for p in points]
+    np.testing.assert_allclose(geometry.area[: len(points)], area, rtol=1e-4)
+    real = query_field.receiver < len(QUERIES.mask)
+    expected = np.array(area)[query_field.sender[real]]
+    expected /= np.pi * config.query.radius**2
+    np.testing.assert_allclose(query_field.weight[real], expected, rtol=1e-4)
+
+
+def test_exact_limits_give_the_same_geometry(surface):
+    """Larger capacities only add padding."""
+    config, geometry, query_field, demands = surface
+    exact = ge.Limits(tuple((name, int(d)) for name, d in demands.items()))
+    tight, tight_query, same = as_numpy(jitted(config, exact, CLOUD, QUERIES))
+    assert same == demands
+    count = len(tight.levels[0].mask)
+    assert tight.levels[0].mask.all()
+    np.testing.assert_array_equal(tight.area, geometry.area[:count])
+    for conv in config.encoder:
+        few, many = tight.fields[conv.name], geometry.fields[conv.name]
+        rows = len(tight.levels[conv.target].mask)
+        wide = len(geometry.levels[conv.target].mask)
+        assert pairs(few, rows) == pairs(many, wide)
+        assert sum(few.weight) == pytest.approx(sum(many.weight), rel=1e-5)
+    few = query_field.receiver < len(QUERIES.mask)
+    np.testing.assert_array_equal(tight_query.weight, query_field.weight[few])
+
+
+@pytest.fixture(scope="module")
+def shallow():
+    demands = as_numpy(demands_of(SHALLOW, generous(SHALLOW), CLOUD, QUERIES))
+    assert ge.fits(generous(SHALLOW), as_jax(demands))
+    return demands
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("level_0.candidates",),
+        ("level_0.edges",),
+        ("level_0.points",),
+        ("conv_0.candidates", "query.candidates"),
+        ("conv_0.edges", "query.edges"),
+        ("conv_0.pairs", "query.pairs"),
+    ],
+)
+def test_limits_that_are_too_small_are_named(shallow, names):
+    sizes = dict(generous(SHALLOW).sizes)
+    limits = ge.Limits(tuple((sizes | {n: int(shallow[n]) - 1 for n in names}).items()))
+    demands = demands_of(SHALLOW, limits, CLOUD, QUERIES)
+    assert not ge.fits(limits, demands)
+    assert ge.exceeded(limits, demands) == {name: shallow[name] for name in names}
+
+
+@pytest.mark.parametrize("start", [100, 1 << 14])
+def test_measured_limits_fit(start):
+    """From limits that are too small, and from generous ones."""
+    clouds = [CLOUD._replace(position=CLOUD.position * s) for s in (0.7, 1.0)]
+    tried = []
+
+    def probe(limits, i):
+        tried.append((i, limits))
+        cloud = jax.tree.map(jnp.asarray, clouds[i])
+        return as_jax(demands_by_hand(cloud, limits))
+
+    first = ge.uniform_limits(SHALLOW, start)
+    limits = ge.measure_limits(first, probe, 2, slack=1.0)
+    assert tried[0] == (0, first)
+    for i in range(2):
+        assert ge.exceeded(limits, probe(limits, i)) == {}
+
+
+def demands_by_hand(cloud, limits):
+    """Demands that, as real ones, are known only as far as limits reach."""
+    size = float(np.abs(cloud.position).max())
+    demands = {name: int(300 * size + i) for i, name in enumerate(dict(limits.sizes))}
+    for name in demands:
+        if name.endswith("edges"):
+            candidates = name.replace("edges", "candidates")
+            demands[name] = min(demands[name], limits.of(candidates))
+    return demands
+
+
+def test_raised_limits_hold_the_demands_and_leave_the_rest():
+    limits = ge.Limits((("a", 100), ("b", 1000), ("c", 7)))
+    raised = ge.raise_limits(limits, {"a": 300, "b": 10}, 1.5)
+    assert raised.of("a") >= 450
+    assert (raised.of("b"), raised.of("c")) == (1000, 7)
+    assert hash(raised) != hash(limits)
+
+
+@given(st.integers(0, 10**8))
+def test_rounded_capacities_hold_their_count(count):
+    size = ge.round_up(count)
+    assert count <= size <= max(count * 9 / 8, count + 64)
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 6), st.integers(0, 4)), unique=True, max_size=8)
+)
+def test_turned_edges_are_the_same_pairs(drawn):
+    """Edges as (receiver of 7, sender of 5), padded to 9 rows."""
+    drawn = sorted(drawn)
+    receiver, sender = np.full(9, 7, np.int32), np.zeros(9, np.int32)
+    for row, (r, s) in enumerate(drawn):
+        receiver[row], sender[row] = r, s
+    need = jnp.int32(len(drawn))
+    edges = Edges(jnp.asarray(sender), jnp.asarray(receiver), Demand(need, need))
+    turned = as_numpy(ge.turn_edges(edges, 5, 7))
+    real = turned.receiver < 5
+    assert (turned.receiver[~real] == 5).all()
+    listed = zip(turned.sender[real], turned.receiver[real], strict=True)
+    assert sorted(listed) == drawn
+
+
+def test_presets_name_each_limit_once():
+    for config in PRESETS.values():
+        names = ge.limit_names(config)
+        assert len(set(names)) == len(names)
+        assert ge.uniform_limits(config, 5).of(names[-1]) == 5
+
+
+def test_only_convolutions_between_levels_are_turned():
+    config = NETWORKS["surface"]
+    twins = {c.name: ge.transposed(config, c) for c in config.encoder}
+    assert twins == {"conv_0": None, "pool_1": "up_1", "conv_1": None, "up_1": None}
+    kde = NETWORKS["kde"]
+    assert not any(ge.transposed(kde, c) for c in kde.encoder)
+    released = Network((0.1,) * 4, released_table(2, (0.1, 0.2, 0.4)), kde.query, 2, 2)
+    twins = {c.name: ge.transposed(released, c) for c in released.encoder}
+    # pool_1 reaches half as far as up_1.
+    assert {k: v for k, v in twins.items() if v} == {"pool_2": "up_2", "pool_3": "up_3"}

@@ -1,0 +1,208 @@
+"""Values at points and pixels, by a network with its initial parameters."""
+
+import re
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+import tiny
+
+from ginn_jax import image
+from ginn_jax.errors import InputError
+from ginn_jax.geometry import Limits
+
+KEY = jax.random.key(3)
+PIXELS = 300
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _cheap_compiling():
+    with tiny.cheap_compiling():
+        yield
+
+
+@pytest.fixture(autouse=True)
+def _small_blocks(monkeypatch):
+    monkeypatch.setattr(image, "BLOCK", 128)
+
+
+@pytest.fixture(scope="module")
+def variables():
+    return tiny.fresh_state().variables
+
+
+@pytest.fixture(scope="module")
+def encoded(variables):
+    """Codes of a cloud of 1000 points, with limits that are too generous."""
+    return encode(variables, tiny.LIMITS)[0]
+
+
+def encode(variables, limits):
+    points = tiny.sphere_on_plane(1000, 4)
+    return image.encode_cloud(
+        tiny.NETWORK, limits, variables, points.position, points.normal, key=KEY
+    )
+
+
+def shade(variables, encoded, points, limits=tiny.LIMITS):
+    return image.shade_points(
+        tiny.NETWORK, limits, variables, encoded, points.position, points.normal
+    )
+
+
+def with_limits(**sizes):
+    """The usual limits but for some; `__` stands for the dot."""
+    changed = {name.replace("__", "."): size for name, size in sizes.items()}
+    return Limits(tuple((dict(tiny.LIMITS.sizes) | changed).items()))
+
+
+@pytest.fixture(scope="module")
+def values(variables, encoded):
+    """At 300 points, in blocks of 128."""
+    points = tiny.sphere_on_plane(PIXELS, 5)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(image, "BLOCK", 128)
+        found, limits = shade(variables, encoded, points)
+    assert limits == tiny.LIMITS
+    assert found.shape == (PIXELS,)
+    assert found.std() > 1e-3
+    return found
+
+
+def test_values_do_not_depend_on_blocks(variables, encoded, values, monkeypatch):
+    monkeypatch.setattr(image, "BLOCK", 512)
+    found, _ = shade(variables, encoded, tiny.sphere_on_plane(PIXELS, 5))
+    np.testing.assert_allclose(found, values, atol=1e-5)
+
+
+def test_values_stay_with_their_points(variables, encoded, values):
+    points = tiny.sphere_on_plane(PIXELS, 5)
+    turned = type(points)(*(column[::-1] for column in points))
+    found, _ = shade(variables, encoded, turned)
+    np.testing.assert_allclose(found[::-1], values, atol=1e-5)
+
+
+def test_too_small_search_is_raised(variables, encoded, values):
+    small = with_limits(query__candidates=64, query__edges=64)
+    found, limits = shade(variables, encoded, tiny.sphere_on_plane(PIXELS, 5), small)
+    np.testing.assert_allclose(found, values, atol=1e-5)
+    before, raised = dict(small.sizes), dict(limits.sizes)
+    assert {n for n in raised if raised[n] != before[n]} == {
+        "query.candidates",
+        "query.edges",
+    }
+    assert raised["query.edges"] > 64
+
+
+def test_too_small_geometry_is_raised(variables, encoded):
+    small = with_limits(level_0__points=128)
+    found, limits = encode(variables, small)
+    assert limits.of("level_0.points") > 128
+    mask, expected = np.array(found.points.mask), np.array(encoded.points.mask)
+    assert mask.sum() == expected.sum() > 200
+    np.testing.assert_allclose(
+        np.array(found.points.position)[mask],
+        np.array(encoded.points.position)[expected],
+    )
+    np.testing.assert_allclose(
+        np.array(found.codes)[mask], np.array(encoded.codes)[expected], atol=1e-5
+    )
+
+
+def picture(mask):
+    """Pixel positions and normals for a mask, not a number outside it."""
+    points = tiny.sphere_on_plane(PIXELS, 5)
+    position = np.full((*mask.shape, 3), np.nan, np.float32)
+    normal = position.copy()
+    position[mask], normal[mask] = points.position, points.normal
+    return position, normal
+
+
+def test_only_masked_pixels_are_computed(variables, encoded, values):
+    mask = np.random.default_rng(0).permutation(24 * 25).reshape(24, 25) < PIXELS
+    result, _ = image.shade_image(
+        tiny.NETWORK, tiny.LIMITS, variables, encoded, *picture(mask), mask, 0.25
+    )
+    assert result.shape == mask.shape
+    assert result.dtype == np.float32
+    np.testing.assert_array_equal(result[~mask], np.float32(0.25))
+    np.testing.assert_allclose(result[mask], np.clip(values, 0, 1), atol=1e-6)
+
+
+def test_number_of_blocks_is_that_of_the_foreground(
+    variables, encoded, values, monkeypatch
+):
+    calls, shade_block = [], image._shade
+
+    def counted(*arguments):
+        calls.append(int(arguments[-1].mask.sum()))
+        return shade_block(*arguments)
+
+    monkeypatch.setattr(image, "_shade", counted)
+    mask = np.arange(24 * 25).reshape(24, 25) >= 300
+    arguments = (tiny.NETWORK, tiny.LIMITS, variables, encoded)
+    image.shade_image(*arguments, *picture(mask), mask)
+    assert calls == [128, 128, 44]
+
+
+def test_empty_picture_is_background(variables, encoded):
+    blank = np.full((5, 4, 3), np.nan, np.float32)
+    result, limits = image.shade_image(
+        tiny.NETWORK,
+        tiny.LIMITS,
+        variables,
+        encoded,
+        blank,
+        blank,
+        np.zeros((5, 4), bool),
+    )
+    np.testing.assert_array_equal(result, np.ones((5, 4), np.float32))
+    assert limits == tiny.LIMITS
+
+
+def test_points_far_away_are_finite_and_disturb_no_other(variables, encoded, values):
+    points = tiny.sphere_on_plane(PIXELS, 5)
+    position = points.position.copy()
+    position[:50] += np.float32([30, -40, 500])
+    position[50] = 1e6
+    found, _ = shade(variables, encoded, points._replace(position=position))
+    assert np.isfinite(found).all()
+    np.testing.assert_allclose(found[51:], values[51:], atol=1e-6)
+
+
+def test_unusable_cloud_is_refused(variables):
+    points = tiny.sphere_on_plane(20, 0)
+    arguments = (tiny.NETWORK, tiny.LIMITS, variables)
+    nothing = np.zeros((0, 3), np.float32)
+    with pytest.raises(InputError, match=r"^the cloud is empty[^\n]*$"):
+        image.encode_cloud(*arguments, nothing, nothing, key=KEY)
+    for field in ("position", "normal"):
+        for bad in (np.nan, np.inf):
+            broken = getattr(points, field).copy()
+            broken[7, 1] = bad
+            cloud = points._replace(**{field: broken})
+            with pytest.raises(InputError, match=r"^[^\n]*non-finite[^\n]*$"):
+                image.encode_cloud(*arguments, cloud.position, cloud.normal, key=KEY)
+
+
+def test_openness_lies_between_0_and_1():
+    values = np.array([-3, -0.0, 0.25, 1, 1.5, np.inf], np.float32)
+    np.testing.assert_array_equal(image.as_openness(values), [0, 0, 0.25, 1, 1, 1])
+
+
+def test_other_disk_radius_changes_the_finest_level_only():
+    other = image.with_disk_radius(tiny.NETWORK, 0.05)
+    assert other == replace(tiny.NETWORK, levels=(0.05, 0.2))
+
+
+@pytest.mark.parametrize("radius", [0.0, -0.1, 0.16, 0.3, np.nan, np.inf])
+def test_unusable_disk_radius_is_refused(radius):
+    with pytest.raises(InputError, match=rf"^Poisson radius {re.escape(str(radius))}"):
+        image.with_disk_radius(tiny.NETWORK, radius)
+
+
+def test_disk_radius_beyond_level_1_is_refused():
+    network = replace(tiny.NETWORK, levels=(0.08, 0.1))
+    with pytest.raises(InputError, match=r"exceeds level 1's 0\.1"):
+        image.with_disk_radius(network, 0.12)
