@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks import require, start
 from benchmarks.timing import Timing, describe, load, measure
 from ginn_jax import report, scenes
+from ginn_jax.commandline import require, start
 from ginn_jax.errors import InputError
 from ginn_jax.mesh import sample_surface
 from ginn_jax.neighbors import find_neighbors
@@ -57,7 +57,7 @@ QUICK = {"points": 2000, "queries": 8192, "radii": (0.05,), "repeats": 2}
 
 def kdtree_lists(workers: int) -> Search:
     """SciPy's lists per query, flattened; `workers` -1 takes all cores."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import cKDTree  # pyright: ignore
 
     def search(points: np.ndarray, queries: np.ndarray, radius: float) -> Pairs:
         tree = cKDTree(points)
@@ -74,7 +74,7 @@ def kdtree_lists(workers: int) -> Search:
 
 def kdtree_pairs(workers: int) -> Search:
     """SciPy's sparse distance matrix of two trees, queries split among threads."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import cKDTree  # pyright: ignore
 
     def search(points: np.ndarray, queries: np.ndarray, radius: float) -> Pairs:
         tree, below = cKDTree(points, leafsize=8), np.nextafter(radius, 0)
@@ -105,7 +105,8 @@ PEERS: dict[str, Callable[[], Search]] = {
 
 def available() -> tuple[dict[str, Search], list[str]]:
     """Ours and the peers that are installed, and the names of those that are not."""
-    searches, missing = {OURS: find_neighbors}, []
+    searches: dict[str, Search] = {OURS: find_neighbors}
+    missing: list[str] = []
     for name, make in PEERS.items():
         try:
             searches[name] = make()
@@ -137,8 +138,8 @@ CLOUDS = {"uniform": uniform, "clusters": clusters, "surface": surface}
 
 def same_pairs(a: Pairs, b: Pairs, points: int) -> bool:
     """Whether both hold the same pairs, in any order, none twice."""
-    keys = [np.sort(query.astype(np.int64) * points + point) for query, point in (a, b)]
-    return np.array_equal(*keys) and bool((np.diff(keys[0]) > 0).all())
+    ours, theirs = (np.sort(q.astype(np.int64) * points + p) for q, p in (a, b))
+    return np.array_equal(ours, theirs) and bool((np.diff(ours) > 0).all())
 
 
 def compare(options: Options, cloud: str, radius: float) -> dict[str, Any]:

@@ -19,10 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks import require, start
 from benchmarks.timing import describe, load, measure
 from ginn_jax import architecture, report, scenes
 from ginn_jax.architecture import Network
+from ginn_jax.checkpoint import load_weights
+from ginn_jax.commandline import require, start
 from ginn_jax.dataset import ShadedPoints
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import View, image_errors, reference_view
@@ -44,10 +45,11 @@ from ginn_jax.image import (
     with_disk_radius,
 )
 from ginn_jax.mcconv import Oriented
-from ginn_jax.mesh import Samples, find_meshes, sample_surface
+from ginn_jax.mesh import Samples, find_meshes
 from ginn_jax.metrics import mse
 from ginn_jax.neighbors import bucket, pad_rows
 from ginn_jax.network import Variables
+from ginn_jax.reference import build_scene
 from ginn_jax.train import Training, init_state
 
 UNSEEN_SEED = 20_000_000
@@ -121,23 +123,17 @@ def load_model(folder: Path | None) -> Model:
     if folder is None:
         network = architecture.DEFAULT
         config = Training(network, steps=1, batch_size=1, points=64, queries=64)
-        blank = ShadedPoints(*(np.zeros((1, 64, *s), np.float32) for s in _SHAPES))
-        state = init_state(config, uniform_limits(network, 64), blank)
+        state = init_state(config, uniform_limits(network, 64))
         return Model(network, state.variables, scenes.Occlusion.radius)
-    from ginn_jax.checkpoint import load_weights
-
-    network, _, variables = load_weights(folder)
+    config, _, variables = load_weights(folder)
     record = json.loads((folder / "run.json").read_text())
-    return Model(network, variables, record["occlusion"]["radius"])
-
-
-_SHAPES = ((3,), (3,), (), ())
+    return Model(config.network, variables, record["occlusion"]["radius"])
 
 
 def make_subject(source: scenes.Source, options: Options, radius: float) -> Subject:
     """Sample and ray-trace an object; the points asked are others than those given."""
     mesh = scenes.load_object(source)
-    given = sample_surface(mesh, options.points, seed=source.seed)
+    given = scenes.visible_samples(build_scene(mesh), options.points, source.seed)
     settings = scenes.Occlusion(ASKED, options.rays, radius)
     asked = scenes.occlusion_cloud(mesh, settings, source.seed + 1)
     view = reference_view(mesh, radius, options.rays, source.seed, options.resolution)
@@ -177,7 +173,7 @@ def tight_limits(network: Network, subject: Subject) -> Limits:
 
 def _padded(position: np.ndarray, normal: np.ndarray, rows: int) -> Oriented:
     points, mask = pad_rows(position, rows)
-    return Oriented(points, pad_rows(normal, rows)[0], mask)
+    return Oriented(*map(jnp.asarray, (points, pad_rows(normal, rows)[0], mask)))
 
 
 def evaluate(model: Model, subject: Subject, radius: float) -> tuple[dict, dict]:
@@ -197,12 +193,12 @@ def evaluate(model: Model, subject: Subject, radius: float) -> tuple[dict, dict]
     shaded = partial(shade_image, network, limits, model.variables, encoded, *pixels)
     image, used_2d = shaded()
     assert used == used_2d == limits, "a capacity that was measured did not suffice"
-    ends = asked.position, asked.normal
+    ends = np.asarray(asked.position), np.asarray(asked.normal)
     values, _ = shade_points(network, limits, model.variables, encoded, *ends)
     noise = float(np.mean(asked.variance))
     row = {"object": subject.name, "radius": radius}
     row |= {"points": int(np.sum(encoded.points.mask)), "pixels": int(pixels[2].sum())}
-    row |= {"mse_3d": mse(as_openness(values), asked.target) - noise}
+    row |= {"mse_3d": mse(as_openness(values), np.asarray(asked.target)) - noise}
     row |= image_errors(subject.view, image)
     row |= {"noise_floor_3d": noise, "limits": dict(limits.sizes)}
     return row, {"f_3D": encode, "f_2D": shaded}

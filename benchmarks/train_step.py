@@ -14,14 +14,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Key
 from matplotlib.figure import Figure
 
-from benchmarks import require, start
 from benchmarks.timing import Timing, describe, load, measure
 from ginn_jax import architecture, fit, report, scenes
+from ginn_jax.commandline import require, start
 from ginn_jax.dataset import ShadedPoints, stack_clouds
 from ginn_jax.errors import InputError
 from ginn_jax.geometry import Limits
@@ -29,10 +30,12 @@ from ginn_jax.network import Variables
 from ginn_jax.process import available_cores
 from ginn_jax.train import (
     Training,
+    TrainState,
     batch_loss,
     batch_mesh,
     init_state,
     make_example,
+    place,
     split_variables,
     train_step,
 )
@@ -99,11 +102,16 @@ def stage_results(
 
 
 def stage_call(
-    config: Training, limits: Limits, stage: str, batch: ShadedPoints
+    config: Training,
+    limits: Limits,
+    stage: str,
+    fresh: TrainState,
+    batch: ShadedPoints,
 ) -> Callable[[], Any]:
     """A compiled stage, or the whole step, on the devices that share the batch."""
-    state = [init_state(config, limits, batch)]
     if stage == "step":
+        # A copy, for the step takes it over, placed as the step returns it.
+        state = [place(config, jax.tree.map(jnp.copy, fresh))]
 
         def advance() -> Any:
             after, told = train_step(config, limits, state.pop(), batch)
@@ -125,7 +133,7 @@ def stage_call(
         check_vma=False,
     )
     key = jax.random.key(config.seed)
-    return partial(jax.jit(split), state[0].variables, key, batch)
+    return partial(jax.jit(split), fresh.variables, key, batch)
 
 
 def differences(timings: Iterable[Timing]) -> list[float]:
@@ -137,7 +145,8 @@ def profile(
     config: Training, limits: Limits, batch: ShadedPoints, repeats: int
 ) -> dict[str, Any]:
     """Seconds that each stage adds, and the share of geometry in the whole step."""
-    calls = {s: stage_call(config, limits, s, batch) for s in STAGES}
+    fresh = init_state(config, limits)
+    calls = {s: stage_call(config, limits, s, fresh, batch) for s in STAGES}
     timings = measure(calls, repeats)
     if not bool(calls["step"]()[1].fits):
         raise InputError("a limit was too small: measure them on more --shapes")

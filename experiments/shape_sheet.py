@@ -3,18 +3,17 @@
 Ray-traces the ambient occlusion of each shape on its ground, and writes shapes.png.
 """
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
 from jaxtyping import Float, UInt8
 from skimage.io import imsave
 
 from ginn_jax import reference
 from ginn_jax.camera import orbit_camera
+from ginn_jax.commandline import start
 from ginn_jax.errors import InputError
 from ginn_jax.mesh import Mesh, add_ground
 from ginn_jax.shapes import random_shape
@@ -71,8 +70,4 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Options))
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    start(Options, main, {})

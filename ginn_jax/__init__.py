@@ -7,17 +7,27 @@ After "Deep-learning the Latent Space of Light Transport" (EGSR 2019).
 
 Modules, in the order the data flows; each imports only what stands before it:
 
-    mesh, shapes      triangles, procedural objects, surface samples
-    reference         ground truth by ray tracing (the only module with a renderer)
-    dataset           shaded points: one type for a cloud and for a G-buffer
-    neighbors         fixed-capacity voxel hash, radius search
-    hierarchy         Poisson disk sampling and its levels
+    errors            the exception for mistakes in the user's input
+    process           settings of a process that make XLA faster on CPU
+    orientation, mesh triangles: loading, mending, unit box, ground, surface samples
+    sdf, solids, *_shapes, shapes    the seeded source of procedural objects
+    camera            pinhole cameras
+    libllvm, reference    ground truth by ray tracing (the only use of a renderer)
+    voxels            fixed-capacity voxel hash under jit
+    neighbors         radius search on the host: exact, sizes itself
+    hierarchy         Poisson disk sampling
     mcconv            receptive fields and Monte Carlo convolution
-    network           f_3D and f_2D as a table of layers
-    train             limits, one jitted step, predictions
-    checkpoint        saving and resuming a training run
-    image             from a mesh and a camera to a shaded image
+    dataset           shaded points: one type for a cloud and for a G-buffer
+    scenes            from objects to clouds with ground truth, in worker processes
+    architecture      the network as a table of layers; presets
+    geometry          levels, edges and weights of a cloud; capacities and demands
+    network           f_3D and f_2D
+    train             one jitted step: geometry, gradient, update
+    checkpoint        saving, resuming, loading weights
+    fit               the training loop of a run
+    image             from a cloud and a G-buffer to an image
     metrics           errors, noise floors, equal ray counts
+    evaluate          errors at points, in images, against run time
     report            metrics.json, report.md and figures of an experiment
 
 Shape letters: N source points, M queries, E edges, C channels, D kernel inputs,

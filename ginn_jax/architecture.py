@@ -126,7 +126,7 @@ def compact_table(
 
 
 def compact_network(
-    k: int = 16,
+    k: int = 24,
     levels: tuple[float, ...] = (0.02, 0.05, 0.1),
     within: float = 2.5,
     between: float = 1.5,
@@ -138,7 +138,7 @@ def compact_network(
     return Network(
         levels=levels,
         encoder=compact_table(k, levels, within, between),
-        query=Conv("query", 0, QUERY, query_radius, 0.25, latent),
+        query=Conv("query", 0, QUERY, query_radius, 0.25, latent, "raw"),
         latent=latent,
         head=latent,
         **more,

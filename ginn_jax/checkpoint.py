@@ -2,16 +2,20 @@
 
 import json
 import shutil
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import jax
 import orbax.checkpoint as ocp
+from jax.sharding import SingleDeviceSharding
 
+from ginn_jax.architecture import Conv, Network
 from ginn_jax.errors import InputError
 from ginn_jax.geometry import Limits
-from ginn_jax.train import Training, TrainState
+from ginn_jax.network import Variables
+from ginn_jax.train import Training, TrainState, state_shapes
 
 KEPT = 2
 
@@ -46,7 +50,7 @@ def restore_state(
     step = manager.latest_step()
     if step is None:
         return None
-    shapes = jax.tree.map(ocp.utils.to_shape_dtype_struct, like._asdict())
+    shapes = jax.tree.map(_shape_of, like._asdict())
     try:
         found = manager.restore(step, args=ocp.args.StandardRestore(shapes))
     except Exception as error:
@@ -56,6 +60,11 @@ def restore_state(
             f"checkpoint {folder} cannot be read ({reason}): delete it or start anew"
         ) from None
     return TrainState(**found)
+
+
+def _shape_of(leaf: Any) -> jax.ShapeDtypeStruct:
+    """Shape, type and place of an array or of a description of one."""
+    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding)
 
 
 def save_run(
@@ -98,3 +107,39 @@ def load_run(folder: Path, config: Training, extra: dict[str, Any]) -> Limits:
                 f"{path} was made with another {name}: resume with the same"
             )
     return limits
+
+
+def load_weights(folder: Path) -> tuple[Training, Limits, Variables]:
+    """What a finished run in `folder` trained: its configuration, capacities, weights.
+
+    Raises:
+        InputError: no run there, no checkpoint yet, or a damaged file.
+    """
+    path = folder / "run.json"
+    try:
+        record = json.loads(path.read_text())
+        config = _training_from(record["training"])
+        limits = Limits(tuple((k, int(v)) for k, v in record["limits"].items()))
+    except FileNotFoundError:
+        raise InputError(f"{folder} holds no run: name the --out of one") from None
+    except (ValueError, KeyError, AttributeError, TypeError):
+        raise InputError(f"{path} is damaged: train again") from None
+    here = SingleDeviceSharding(jax.devices()[0])
+    like = jax.tree.map(
+        lambda s: jax.ShapeDtypeStruct(s.shape, s.dtype, sharding=here),
+        state_shapes(config, limits),
+    )
+    with closing(open_manager(folder)) as manager:
+        state = restore_state(manager, like)
+    if state is None:
+        raise InputError(f"{folder} holds no checkpoint yet: let its run go on")
+    return config, limits, state.variables
+
+
+def _training_from(record: dict[str, Any]) -> Training:
+    """The configuration that `save_run` wrote."""
+    network = dict(record["network"])
+    network["levels"] = tuple(network["levels"])
+    network["encoder"] = tuple(Conv(**row) for row in network["encoder"])
+    network["query"] = Conv(**network["query"])
+    return Training(**{**record, "network": Network(**network)})

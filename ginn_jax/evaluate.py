@@ -12,13 +12,7 @@ from ginn_jax.architecture import Network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.dataset import ShadedPoints
 from ginn_jax.geometry import Limits
-from ginn_jax.image import (
-    as_openness,
-    encode_cloud,
-    shade_image,
-    shade_points,
-    with_disk_radius,
-)
+from ginn_jax.image import as_openness, encode_cloud, shade_image, shade_points
 from ginn_jax.mesh import Mesh
 from ginn_jax.metrics import dssim, equal_rays, mse, tone_map
 from ginn_jax.network import Variables
@@ -160,15 +154,10 @@ def timed(work: Callable[[], Any], repeats: int = 3) -> tuple[Any, float, float]
 
 
 def network_row(
-    network: Network,
-    limits: Limits,
-    model: Model,
-    cloud: ShadedPoints,
-    view: View,
-    radius: float,
+    network: Network, limits: Limits, model: Model, cloud: ShadedPoints, view: View
 ) -> tuple[Row, Float[np.ndarray, "H W"], Limits]:
-    """Errors and times of the network at one Poisson disk radius, and its image."""
-    network = with_disk_radius(network, radius)
+    """Errors and times of the network on one object, its image, the limits it took."""
+    radius = network.levels[0]
     arguments = (cloud.position, cloud.normal)
     _, limits = encode_cloud(
         network, limits, model.variables, *arguments, key=model.key

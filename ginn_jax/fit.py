@@ -34,9 +34,9 @@ from ginn_jax.train import (
     train_step,
 )
 
-PROBES = 60
-PROBE_SLACK = 1.2
-RAISE_SLACK = 1.15
+PROBES = 300
+PROBE_SLACK = 1.25
+RAISE_SLACK = 1.25
 
 
 @dataclass(frozen=True)
@@ -86,20 +86,22 @@ def fit(
         limits = training_limits(config, clouds)
         save_run(folder, config, limits, extra or {})
     manager = open_manager(folder, fresh=not resume)
-    state = init_state(config, limits, _batch(config, clouds, 0))
+    state = init_state(config, limits)
     losses = np.zeros(0, np.float32)
     if resume and (found := restore_state(manager, state)) is not None:
         state, losses = found, load_losses(folder, int(found.step))
     seconds = {"compile": time.perf_counter() - start, "train": 0.0}
-    history, raised = list(losses), {}
+    history: list[float] = losses.tolist()
+    raised: dict[str, int] = {}
+    compiled_for = None
     while int(state.step) < config.steps:
         step = int(state.step)
         begin = time.perf_counter()
-        first_of_shape = train_step._cache_size()
         state, report = train_step(config, limits, state, _batch(config, clouds, step))
         loss = float(report.loss)
-        compiled = train_step._cache_size() > first_of_shape
-        seconds["compile" if compiled else "train"] += time.perf_counter() - begin
+        purpose = "train" if compiled_for == limits else "compile"
+        seconds[purpose] += time.perf_counter() - begin
+        compiled_for = limits
         if short := exceeded(limits, jax.device_get(report.demands)):
             limits = raise_limits(limits, short, RAISE_SLACK)
             raised |= short
@@ -120,15 +122,16 @@ def training_limits(config: Training, clouds: Sequence[ShadedPoints]) -> Limits:
     """Capacities that hold random shares of a batch, with slack."""
     share = config.batch_size // batch_mesh(config.batch_size).size
     rng = np.random.default_rng(config.seed)
-    rows = rng.integers(0, len(clouds), (PROBES, share))
-    rows[: len(clouds), 0] = rng.permutation(len(clouds))[:PROBES]
+    probes = min(len(clouds), PROBES)
+    rows = rng.integers(0, len(clouds), (probes, share))
+    rows[:, 0] = rng.permutation(len(clouds))[:probes]
 
     def probe(limits: Limits, i: int) -> dict[str, Any]:
         batch = stack_clouds([clouds[j] for j in rows[i]])
         return jax.device_get(probe_step(config, limits, batch, key=jax.random.key(i)))
 
     generous = uniform_limits(config.network, 16 * share * config.points)
-    return measure_limits(generous, probe, PROBES, PROBE_SLACK)
+    return measure_limits(generous, probe, probes, PROBE_SLACK)
 
 
 def save_losses(folder: Path, history: Sequence[float]) -> None:

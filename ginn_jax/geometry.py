@@ -23,7 +23,7 @@ from ginn_jax.mcconv import (
     point_area,
     surface_weight,
 )
-from ginn_jax.neighbors import EdgeLimit, Edges, VoxelGrid, build_grid, radius_edges
+from ginn_jax.voxels import EdgeLimit, Edges, VoxelGrid, build_grid, radius_edges
 
 Demands = dict[str, Int[Array, ""]]
 

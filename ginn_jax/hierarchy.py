@@ -8,15 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
-from ginn_jax.neighbors import (
-    Demand,
-    EdgeLimit,
-    VoxelGrid,
-    bucket,
-    compact,
-    find_neighbors,
-    radius_edges,
-)
+from ginn_jax.neighbors import bucket, find_neighbors
+from ginn_jax.voxels import Demand, EdgeLimit, VoxelGrid, compact, radius_edges
 
 WAITING, DROPPED, KEPT = 1, 0, 2
 

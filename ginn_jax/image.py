@@ -6,7 +6,7 @@ too small they raise it and try again; the limits that sufficed come back for re
 """
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -20,11 +20,13 @@ from ginn_jax.geometry import (
     build_geometry,
     build_query_field,
     exceeded,
+    limits_for,
     raise_limits,
 )
 from ginn_jax.mcconv import Oriented
-from ginn_jax.neighbors import VoxelGrid, bucket, pad_rows
+from ginn_jax.neighbors import bucket, pad_rows
 from ginn_jax.network import Encoder, Shader, Variables
+from ginn_jax.voxels import VoxelGrid
 
 BLOCK = 1 << 15
 SLACK = 1.25
@@ -48,7 +50,7 @@ def encode(
 ) -> tuple[Encoded, Demands]:
     """f_3D with all its geometry."""
     geometry, demands = build_geometry(network, limits, cloud, key=key)
-    codes = Encoder(network, train=False).apply(
+    codes: Any = Encoder(network, train=False).apply(
         variables["encoder"], geometry.levels[0].normal, geometry
     )
     encoded = Encoded(geometry.levels[0], geometry.grid, geometry.area, codes)
@@ -66,7 +68,7 @@ def shade(
     field, demands = build_query_field(
         network, limits, encoded.points, encoded.grid, encoded.area, queries
     )
-    values = Shader(network, train=False).apply(
+    values: Any = Shader(network, train=False).apply(
         variables["shader"], encoded.codes, queries.normal, queries.mask, field
     )
     return values, demands
@@ -183,3 +185,19 @@ def with_disk_radius(network: Network, radius: float) -> Network:
             f"Poisson radius {radius} exceeds level 1's {network.levels[1]}"
         )
     return replace(network, levels=(radius, *network.levels[1:]))
+
+
+def limits_at(network: Network, limits: Limits, radius: float) -> Limits:
+    """Capacities to expect at another finest Poisson disk radius.
+
+    Points go with the inverse square of the radius, pairs within the finest level with
+    the square of that. A guess: whoever uses it still compares demands.
+    """
+    growth = (network.levels[0] / radius) ** 2
+    power = {"level_0.points": 1, "level_1.candidates": 2, "level_1.edges": 2}
+    for conv in (*network.encoder, network.query):
+        ends = (conv.source == 0) + (conv.target == 0)
+        power |= {f"{conv.name}.{p}": ends for p in ("candidates", "edges", "pairs")}
+    return limits_for(
+        {name: int(n * growth ** power.get(name, 0)) for name, n in limits.sizes}, 1.0
+    )

@@ -20,9 +20,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from ginn_jax.neighbors import Edges, expand_ranges
+from ginn_jax.voxels import Edges, expand_ranges
 
 OFFSET_INPUTS, ORIENTED_INPUTS = 3, 7
 
@@ -50,9 +51,9 @@ class Kernel(NamedTuple):
 class Oriented(NamedTuple):
     """Points with unit normals, some of them padding."""
 
-    position: Float[Array, "N 3"]
-    normal: Float[Array, "N 3"]
-    mask: Bool[Array, "N"]
+    position: Float[Array | np.ndarray, "N 3"]
+    normal: Float[Array | np.ndarray, "N 3"]
+    mask: Bool[Array | np.ndarray, "N"]
 
 
 def edge_offsets(

@@ -113,7 +113,6 @@ class Shader(nn.Module):
     ) -> Float[Array, "M"]:
         config = self.config
         layer = McConv(config, config.query, self.train, name=config.query.name)
-        # Codes are normalised already: `before` of the query row is not applied.
         x = layer(codes, jnp.ones(codes.shape[0], bool), field, attributes.shape[0])
         x = Norm(config.norm, self.train)(x, mask)
         x = nn.Dense(config.head)(jnp.concatenate([x, attributes], axis=1))

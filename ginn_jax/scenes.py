@@ -9,15 +9,25 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ginn_jax.dataset import ShadedPoints, load_cloud, save_cloud
 from ginn_jax.errors import InputError, InputWarning
-from ginn_jax.mesh import Mesh, add_ground, fit_unit_box, load_mesh, sample_surface
-from ginn_jax.reference import ambient_occlusion
+from ginn_jax.mesh import (
+    Mesh,
+    Samples,
+    add_ground,
+    fit_unit_box,
+    load_mesh,
+    sample_surface,
+)
+from ginn_jax.reference import Scene, ambient_occlusion, build_scene
 from ginn_jax.shapes import random_shape
 
 # Bounds what a renderer could leak in one process.
 SCENES_PER_WORKER = 200
-FORMAT = 1
+FORMAT = 2
+FAR, PROBE_RAYS = 100.0, 32
 
 
 @dataclass(frozen=True)
@@ -62,10 +72,11 @@ def load_object(source: Source) -> Mesh:
 
 
 def occlusion_cloud(mesh: Mesh, settings: Occlusion, seed: int) -> ShadedPoints:
-    """Uniform samples of a scene with their ambient occlusion."""
-    samples = sample_surface(mesh, settings.points, seed=seed)
+    """Uniform samples of a scene's visible surface with their ambient occlusion."""
+    scene = build_scene(mesh)
+    samples = visible_samples(scene, settings.points, seed)
     truth = ambient_occlusion(
-        mesh,
+        scene,
         samples.position,
         samples.normal,
         settings.radius,
@@ -73,6 +84,34 @@ def occlusion_cloud(mesh: Mesh, settings: Occlusion, seed: int) -> ShadedPoints:
         seed=seed,
     )
     return ShadedPoints(samples.position, samples.normal, truth.mean, truth.variance)
+
+
+def visible_samples(scene: Scene, count: int, seed: int) -> Samples:
+    """Uniform samples of the surface that light can reach.
+
+    Meshes of many parts hide surface inside other parts, where no camera can be; it
+    would only take points away from what is seen. A sample is dropped if none of
+    `PROBE_RAYS` rays from it leaves the scene.
+
+    Raises:
+        InputError: a scene that is almost all sealed off.
+    """
+    drawn = count
+    for _ in range(5):
+        samples = sample_surface(scene.mesh, drawn, seed=seed)
+        sky = ambient_occlusion(
+            scene,
+            samples.position,
+            samples.normal,
+            FAR,
+            rays=PROBE_RAYS,
+            seed=seed,
+        )
+        seen = np.flatnonzero(sky.mean > 0)
+        if len(seen) >= count:
+            return Samples(*(a[seen[:count]] for a in samples))
+        drawn = 2 * drawn
+    raise InputError("nearly all of the mesh's surface is sealed inside it: mend it")
 
 
 def cloud_origin(source: Source, settings: Occlusion) -> dict[str, Any]:

@@ -27,8 +27,8 @@ from ginn_jax.geometry import (
     fits,
 )
 from ginn_jax.mcconv import Field, Oriented
-from ginn_jax.neighbors import compact
 from ginn_jax.network import Encoder, Shader, Variables
+from ginn_jax.voxels import compact
 
 
 @dataclass(frozen=True)
@@ -268,17 +268,42 @@ def train_step(
     return TrainState(variables, optimizer, step, skipped), report
 
 
-def init_state(config: Training, limits: Limits, batch: ShadedPoints) -> TrainState:
-    """The state before the first step; only the shapes of `batch` matter."""
-    key = jax.random.key(config.seed)
-    example = jax.eval_shape(
-        lambda b: make_example(config, limits, b, key=key)[0], batch
+def init_state(config: Training, limits: Limits) -> TrainState:
+    """The state before the first step."""
+    zeros = jax.tree.map(
+        lambda s: jnp.zeros(s.shape, s.dtype), _example_shapes(config, limits)
     )
-    zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), example)
+    key = jax.random.key(config.seed)
     variables = jax.jit(partial(init_variables, config.network))(zeros, key=key)
+    return place(config, _first_state(config, variables))
+
+
+def state_shapes(config: Training, limits: Limits) -> TrainState:
+    """Shapes and types of a state, without any computation."""
+    return jax.eval_shape(
+        lambda example, key: _first_state(
+            config, init_variables(config.network, example, key=key)
+        ),
+        _example_shapes(config, limits),
+        jax.random.key(0),
+    )
+
+
+def _first_state(config: Training, variables: Variables) -> TrainState:
     params, _ = split_variables(variables)
     optimizer = make_optimizer(config).init(params)
-    return place(config, TrainState(variables, optimizer, jnp.int32(0), jnp.int32(0)))
+    return TrainState(variables, optimizer, jnp.int32(0), jnp.int32(0))
+
+
+def _example_shapes(config: Training, limits: Limits) -> Example:
+    """Shapes of what a step computes from the clouds; capacities decide them."""
+    rows = (config.batch_size, config.points)
+    point, number = (
+        jax.ShapeDtypeStruct((*rows, *more), jnp.float32) for more in ((3,), ())
+    )
+    batch = ShadedPoints(*(point, point, number, number))  # type: ignore[arg-type]
+    example = partial(make_example, config, limits, key=jax.random.key(0))
+    return jax.eval_shape(example, batch)[0]
 
 
 def place(config: Training, state: TrainState) -> TrainState:

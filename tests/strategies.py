@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from ginn_jax.neighbors import EdgeLimit
+from ginn_jax.voxels import EdgeLimit
 
 POINTS, QUERIES = 32, 16
 RADII = st.sampled_from([0.25, 0.1, 1.0])

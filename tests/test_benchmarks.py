@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 import tiny
 
-from benchmarks import hasten, neighbors, poisson_radii, timing, train_step
-from ginn_jax import architecture, checkpoint
+from benchmarks import neighbors, poisson_radii, timing, train_step
+from ginn_jax import architecture
+from ginn_jax.commandline import hasten
 from ginn_jax.errors import InputError
+from ginn_jax.geometry import uniform_limits
 
 
 def test_measure_alternates_and_keeps_order():
@@ -87,25 +89,38 @@ def test_neighbors_stops_at_a_search_that_is_wrong(tmp_path, monkeypatch):
 
 def test_train_step(tmp_path, monkeypatch):
     monkeypatch.setitem(architecture.PRESETS, "default", tiny.NETWORK)
-    monkeypatch.setattr("ginn_jax.fit.PROBES", 2)
-    monkeypatch.setattr("ginn_jax.fit.PROBE_SLACK", 2.0)
+    limits = uniform_limits(tiny.NETWORK, 1 << 15)
+    monkeypatch.setattr("ginn_jax.fit.training_limits", lambda *_: limits)
     options = train_step.Options(
         tmp_path, shapes=1, batch=1, points=600, queries=64, repeats=1
     )
-    metrics = train_step.main(options)
+    stages = ("levels", "edges", "geometry", "step")
+    some = {name: train_step.STAGES[name] for name in stages}
+    monkeypatch.setattr(train_step, "STAGES", some)
+    with jax.numpy_dtype_promotion("standard"):
+        metrics = train_step.main(options)
     share = metrics["columns"]["one device's share"]
-    assert list(share["added"]) == list(train_step.STAGES)
+    assert list(share["added"]) == list(stages)
     assert sum(share["added"].values()) == pytest.approx(share["seconds"])
     assert "a third of" in (tmp_path / "report.md").read_text()
     check_files(tmp_path, "train_step.png")
 
 
+@pytest.mark.parametrize("stage", ["forward", "gradient"])
+def test_later_stages_of_the_step(stage):
+    """Traced only: compiling them takes long and adds nothing."""
+    setting = tiny.CONFIG, tiny.LIMITS, stage, tiny.fresh_state(), tiny.batch()
+    (first, _), demands = jax.eval_shape(train_step.stage_call(*setting))
+    assert set(demands) == set(dict(tiny.LIMITS.sizes))
+    assert isinstance(first, tuple) == (stage == "gradient")
+
+
 @pytest.mark.parametrize("trained", [False, True])
 def test_poisson_radii(tmp_path, monkeypatch, trained):
-    monkeypatch.setattr(architecture, "DEFAULT", tiny.NETWORK)
+    stand_in(monkeypatch)
     variables = jax.tree.map(np.asarray, tiny.fresh_state().variables)
-    record = (tiny.NETWORK, tiny.LIMITS, variables)
-    monkeypatch.setattr(checkpoint, "load_weights", lambda _: record, raising=False)
+    record = (tiny.CONFIG, tiny.LIMITS, variables)
+    monkeypatch.setattr(poisson_radii, "load_weights", lambda _: record)
     (tmp_path / "run.json").write_text('{"occlusion": {"radius": 0.2}}')
     options = poisson_radii.Options(
         tmp_path / "out",
@@ -128,13 +143,19 @@ def test_poisson_radii(tmp_path, monkeypatch, trained):
 
 
 def test_mistakes_are_input_errors(tmp_path, monkeypatch):
-    monkeypatch.setattr(architecture, "DEFAULT", tiny.NETWORK)
+    stand_in(monkeypatch)
     with pytest.raises(InputError, match="--radii"):
         neighbors.main(neighbors.Options(tmp_path, radii=(0.1, -1.0)))
     with pytest.raises(InputError, match="--repeats is 0"):
         train_step.main(train_step.Options(tmp_path, repeats=0))
     with pytest.raises(InputError, match="Poisson radius"):
         poisson_radii.main(poisson_radii.Options(tmp_path, radii=(7.0,)))
+
+
+def stand_in(monkeypatch):
+    """A network that compiles in seconds, and its untrained weights."""
+    monkeypatch.setattr(architecture, "DEFAULT", tiny.NETWORK)
+    monkeypatch.setattr(poisson_radii, "init_state", lambda *_: tiny.fresh_state())
 
 
 def check_files(folder, figure):

@@ -13,7 +13,7 @@ from strategies import ALL_PAIRS, POINTS, RADII, SEEDS, clouds, pad, padded
 
 from ginn_jax import hierarchy as hi
 from ginn_jax.errors import InputError
-from ginn_jax.neighbors import EdgeLimit, build_grid
+from ginn_jax.voxels import EdgeLimit, build_grid
 
 NORMAL = np.arange(3.0 * POINTS, dtype=np.float32).reshape(POINTS, 3)
 FULL = hi.LevelLimit(ALL_PAIRS, POINTS)

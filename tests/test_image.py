@@ -130,6 +130,17 @@ def test_only_masked_pixels_are_computed(variables, encoded, values):
     np.testing.assert_allclose(result[mask], np.clip(values, 0, 1), atol=1e-6)
 
 
+def test_no_pixel_leaves_the_range(variables, encoded):
+    """Not even of a network with a last layer a hundred times as loud."""
+    loud = jax.tree.map(np.array, variables)
+    loud["shader"]["params"]["Dense_1"]["kernel"] *= 100
+    mask = np.arange(24 * 25).reshape(24, 25) < PIXELS
+    arguments = (tiny.NETWORK, tiny.LIMITS, loud, encoded)
+    result, _ = image.shade_image(*arguments, *picture(mask), mask)
+    assert result[mask].min() == 0
+    assert result[mask].max() == 1
+
+
 def test_number_of_blocks_is_that_of_the_foreground(
     variables, encoded, values, monkeypatch
 ):

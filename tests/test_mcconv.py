@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as hnp
 from strategies import ALL_PAIRS, POINTS, QUERIES, SEEDS, UNIT, lattice, pad
 
 from ginn_jax import mcconv as mc
-from ginn_jax.neighbors import EdgeLimit, build_grid, radius_edges
+from ginn_jax.voxels import EdgeLimit, build_grid, radius_edges
 
 CHANNELS, OUTPUTS, HIDDEN, BANDWIDTH = 3, 2, 5, 0.3
 PAIRS = POINTS * POINTS * QUERIES

@@ -9,9 +9,20 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from oracles import neighbors
 from scipy.spatial import cKDTree
-from strategies import ALL_PAIRS, POINTS, QUERIES, RADII, Cloud, clouds, pad, padded
+from strategies import (
+    ALL_PAIRS,
+    POINTS,
+    QUERIES,
+    RADII,
+    Cloud,
+    clouds,
+    coordinates,
+    pad,
+    padded,
+)
 
 from ginn_jax import neighbors as nb
+from ginn_jax import voxels as vx
 from ginn_jax.errors import InputError
 
 INT32_MAX = 2**31 - 1
@@ -26,8 +37,8 @@ def found(points, queries, radius):
     return sorted(pairs)
 
 
-make_grid = jax.jit(nb.build_grid)
-search = jax.jit(nb.radius_edges, static_argnames=("limit", "pair_filter"))
+make_grid = jax.jit(vx.build_grid)
+search = jax.jit(vx.radius_edges, static_argnames=("limit", "pair_filter"))
 
 
 def edges_of(points, queries, radius, limit=ALL_PAIRS, reach=None, pair_filter=None):
@@ -142,6 +153,17 @@ def test_jitted_search_equals_brute_force_but_for_rounding(points, queries, radi
     assert edges.demand.edges <= edges.demand.candidates <= ALL_PAIRS.candidates
 
 
+COARSE = coordinates(st.integers(-4, 4).map(lambda k: k / 8))
+
+
+@given(padded(source=COARSE), st.sampled_from([0.125, 0.25, 0.625]))
+def test_jitted_search_excludes_points_at_exactly_the_radius(points, radius):
+    """Nothing is rounded here, and many distances are the radius, as 3-4-5 / 8 is."""
+    (place, row), edges = points.real(), edges_of(points, points, radius)
+    expected = {(row[i], row[j]) for i, j in neighbors(place, place, radius)}
+    assert pairs_of(edges, points) == expected
+
+
 @given(padded(), RADII)
 def test_search_of_a_cloud_in_itself_equals_brute_force(points, radius):
     sure, possible = sandwich(points, points, radius)
@@ -202,7 +224,7 @@ def dense():
 
 def test_limits_that_are_just_enough_lose_nothing(dense):
     points, need = dense
-    limit = nb.EdgeLimit(int(need.candidates), int(need.edges))
+    limit = vx.EdgeLimit(int(need.candidates), int(need.edges))
     edges = edges_of(points, points, 0.4, limit)
     assert edges.demand == need
     full = edges_of(points, points, 0.4)
@@ -212,7 +234,7 @@ def test_limits_that_are_just_enough_lose_nothing(dense):
 def test_too_few_edges_are_told_exactly(dense):
     points, need = dense
     edges = int(need.edges) - 1
-    short = edges_of(points, points, 0.4, nb.EdgeLimit(ALL_PAIRS.candidates, edges))
+    short = edges_of(points, points, 0.4, vx.EdgeLimit(ALL_PAIRS.candidates, edges))
     assert short.demand == need
     full = pairs_of(edges_of(points, points, 0.4), points)
     assert len(pairs_of(short, points) & full) == edges
@@ -220,7 +242,7 @@ def test_too_few_edges_are_told_exactly(dense):
 
 def test_too_few_candidates_are_told_exactly(dense):
     points, need = dense
-    limit = nb.EdgeLimit(int(need.candidates) - 1, ALL_PAIRS.edges)
+    limit = vx.EdgeLimit(int(need.candidates) - 1, ALL_PAIRS.edges)
     short = edges_of(points, points, 0.4, limit)
     assert short.demand.candidates == need.candidates
     assert short.demand.edges <= need.edges
@@ -232,19 +254,19 @@ def test_demand_saturates_where_int32_would_wrap(total):
     length = np.full(9, total // 9, np.int64)
     length[0] += total - length.sum()
     length = jnp.asarray(length.astype(np.int32))
-    demand = nb.expand_ranges(jnp.zeros(9, jnp.int32), length, 64)[1]
+    demand = vx.expand_ranges(jnp.zeros(9, jnp.int32), length, 64)[1]
     assert int(demand) == min(total, INT32_MAX)
 
 
 def test_search_tells_of_more_candidates_than_int32_counts():
     """66,000 points in one place looked up from each of 66,000 queries."""
     points = pad(np.zeros((66_000, 3), np.float32), 66_000)
-    edges = edges_of(points, points, 0.1, nb.EdgeLimit(64, 64))
+    edges = edges_of(points, points, 0.1, vx.EdgeLimit(64, 64))
     assert int(edges.demand.candidates) == INT32_MAX
 
 
-expand = jax.jit(nb.expand_ranges, static_argnames="capacity")
-squeeze = jax.jit(nb.compact, static_argnames="capacity")
+expand = jax.jit(vx.expand_ranges, static_argnames="capacity")
+squeeze = jax.jit(vx.compact, static_argnames="capacity")
 
 
 @given(st.lists(st.integers(0, 6), min_size=8, max_size=8), st.integers(0, 30))

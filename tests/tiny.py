@@ -84,7 +84,7 @@ def fresh_state(config=CONFIG, limits=LIMITS):
 @cache
 def _initial_state(config, limits):
     with cheap_compiling():
-        return jax.tree.map(np.array, train.init_state(config, limits, batch()))
+        return jax.tree.map(np.array, train.init_state(config, limits))
 
 
 @contextmanager

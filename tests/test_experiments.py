@@ -1,0 +1,82 @@
+"""The scripts as a user meets them: help, mistakes, a small run from nothing."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import pytest
+import tiny
+
+from experiments import ao_train
+from ginn_jax.errors import InputError
+
+ROOT = Path(__file__).parents[1]
+KEYS = ["mse_3d", "relative_mse_3d", "noise_floor_3d", "equal_rays", "mse_2d", "dssim_2d", "seconds_total", "seconds_data", "seconds_compile", "seconds_train", "steps", "unseen_shapes"]
+SMALL = ao_train.Options(
+    shapes=2,
+    test_shapes=3,
+    rays=8,
+    points=1000,
+    steps=2,
+    resolution=32,
+    quick=True,
+)
+
+
+def command(*words):
+    return subprocess.run(
+        [sys.executable, "-m", "experiments.ao_train", *words],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+
+
+def test_help_names_every_option():
+    said = command("--help")
+    assert said.returncode == 0
+    for name in ao_train.Options.__dataclass_fields__:
+        assert "--" + name.replace("_", "-") in said.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "culprit"),
+    [
+        (("--radius", "-1"), "--radius"),
+        (("--steps", "many"), "--steps"),
+        (("--test-meshes", "no/such/folder"), "no/such/folder"),
+    ],
+)
+def test_mistakes_end_in_one_line_and_code_2(words, culprit, tmp_path):
+    said = command("--out", str(tmp_path), *words)
+    assert said.returncode == 2
+    assert len(said.stderr.strip().splitlines()) == 1
+    assert culprit in said.stderr
+    assert "Traceback" not in said.stderr
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"rays": 1}, {"points": 10}, {"steps": 0}, {"radius": float("nan")}]
+)
+def test_options_that_cannot_be_meant_are_refused(wrong):
+    with pytest.raises(InputError, match="--" + next(iter(wrong))):
+        ao_train.main(replace(SMALL, **wrong))
+
+
+def test_a_small_run_leaves_all_that_is_promised(tmp_path, monkeypatch):
+    monkeypatch.setitem(ao_train.architecture.PRESETS, "default", tiny.NETWORK)
+    with tiny.cheap_compiling(), jax.numpy_dtype_promotion("standard"):
+        ao_train.main(replace(SMALL, out=tmp_path))
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert not [key for key in KEYS if key not in metrics]
+    assert metrics["steps"] == 2
+    assert len(metrics["unseen_shapes"]) == 3
+    rays = [r["mse_2d"] for r in metrics["error_against_time"] if "rays" in r]
+    assert rays == sorted(rays, reverse=True)
+    for name in ("learning_curve", "views", "error_against_time"):
+        assert (tmp_path / f"{name}.png").stat().st_size > 1000
+    assert "unseen procedural shapes" in (tmp_path / "report.md").read_text()
