@@ -29,10 +29,10 @@ class ShadedPoints(NamedTuple):
     pixel is a point. `variance` is the Monte Carlo variance of `target`.
     """
 
-    position: Float[Array | np.ndarray, "*P 3"]
-    normal: Float[Array | np.ndarray, "*P 3"]
-    target: Float[Array | np.ndarray, "*P"]
-    variance: Float[Array | np.ndarray, "*P"]
+    position: Float[Any, "*P 3"]
+    normal: Float[Any, "*P 3"]
+    target: Float[Any, "*P"]
+    variance: Float[Any, "*P"]
 
 
 def save_cloud(path: Path, cloud: ShadedPoints, origin: dict[str, Any]) -> None:

@@ -127,7 +127,7 @@ def training_limits(config: Training, clouds: Sequence[ShadedPoints]) -> Limits:
     rows[:, 0] = rng.permutation(len(clouds))[:probes]
 
     def probe(limits: Limits, i: int) -> dict[str, Any]:
-        batch = stack_clouds([clouds[j] for j in rows[i]])
+        batch = stack_clouds([clouds[int(j)] for j in rows[i]])
         return jax.device_get(probe_step(config, limits, batch, key=jax.random.key(i)))
 
     generous = uniform_limits(config.network, 16 * share * config.points)
@@ -151,7 +151,7 @@ def load_losses(folder: Path, steps: int) -> np.ndarray:
 
 def _batch(config: Training, clouds: Sequence[ShadedPoints], step: int) -> ShadedPoints:
     order = batch_order(len(clouds), config.batch_size, step, seed=config.seed)
-    return stack_clouds([clouds[i] for i in order])
+    return stack_clouds([clouds[int(i)] for i in order])
 
 
 def _check(config: Training, clouds: Sequence[ShadedPoints]) -> None:

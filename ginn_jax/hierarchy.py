@@ -1,7 +1,7 @@
 """Poisson disk sampling in parallel, and the levels it builds."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -93,10 +93,10 @@ def draw_lots(count: int, *, key: Key[Array, ""]) -> UInt32[Array, "N"]:
 
 
 def beats(
-    lot: UInt32[Array | np.ndarray, "N"],
-    first: Int[Array | np.ndarray, "E"],
-    second: Int[Array | np.ndarray, "E"],
-) -> Bool[Array | np.ndarray, "E"]:
+    lot: UInt32[Any, "N"],
+    first: Int[Any, "E"],
+    second: Int[Any, "E"],
+) -> Bool[Any, "E"]:
     """Whether point `first` is thrown before point `second`."""
     tie = (lot[first] == lot[second]) & (first < second)
     return (lot[first] < lot[second]) | tie

@@ -101,11 +101,22 @@ def encode_cloud(
     turned, _ = pad_rows(np.asarray(normal, np.float32), rows)
     cloud = Oriented(padded, turned, mask)
     while True:
-        encoded, demands = _encode(network, limits, variables, cloud, key)
+        deep = _without(limits, network.query.name)
+        encoded, demands = _encode(network, deep, variables, cloud, key)
         short = exceeded(limits, demands)
         if not short:
             return encoded, limits
         limits = raise_limits(limits, short, SLACK)
+
+
+def _only(limits: Limits, conv: str) -> Limits:
+    """The limits of one convolution: others must not make it compile again."""
+    return Limits(tuple(s for s in limits.sizes if s[0].startswith(f"{conv}.")))
+
+
+def _without(limits: Limits, conv: str) -> Limits:
+    """The limits of everything else."""
+    return Limits(tuple(s for s in limits.sizes if not s[0].startswith(f"{conv}.")))
 
 
 def shade_points(
@@ -120,13 +131,14 @@ def shade_points(
     copies = [jax.device_put((variables, encoded), d) for d in jax.devices()]
     while True:
         parts, demands = [], []
+        flat = _only(limits, network.query.name)
         for number, first in enumerate(range(0, len(position), BLOCK)):
             block = slice(first, first + BLOCK)
             padded, mask = pad_rows(np.asarray(position[block], np.float32), BLOCK)
             turned, _ = pad_rows(np.asarray(normal[block], np.float32), BLOCK)
             values, demand = _shade(
                 network,
-                limits,
+                flat,
                 *copies[number % len(copies)],
                 Oriented(padded, turned, mask),
             )

@@ -16,11 +16,10 @@ over the senders y_j closer than r. The density p is itself an average over N(x)
 parameters.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ginn_jax.voxels import Edges, expand_ranges
@@ -51,9 +50,9 @@ class Kernel(NamedTuple):
 class Oriented(NamedTuple):
     """Points with unit normals, some of them padding."""
 
-    position: Float[Array | np.ndarray, "N 3"]
-    normal: Float[Array | np.ndarray, "N 3"]
-    mask: Bool[Array | np.ndarray, "N"]
+    position: Float[Any, "N 3"]
+    normal: Float[Any, "N 3"]
+    mask: Bool[Any, "N"]
 
 
 def edge_offsets(

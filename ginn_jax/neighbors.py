@@ -74,7 +74,9 @@ Found = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _search_blocks(
-    points: Float[np.ndarray, "N 3"], queries: Float[np.ndarray, "M 3"], radius: float
+    points: Float[np.ndarray, "N 3"],
+    queries: Float[np.ndarray, "M 3"],
+    radius: np.float32,
 ) -> Found:
     """Query index, point index and squared distance of all pairs within the radius."""
     padded, mask = pad_rows(points, bucket(len(points)))
@@ -91,7 +93,7 @@ def _search_blocks(
 
 
 def _search_block(
-    grid: VoxelGrid, queries: Float[np.ndarray, "M 3"], first: int, radius: float
+    grid: VoxelGrid, queries: Float[np.ndarray, "M 3"], first: int, radius: np.float32
 ) -> list[Found]:
     """The pairs of a block of queries; a block too dense to number is halved."""
     query, query_mask = pad_rows(queries, bucket(len(queries)))

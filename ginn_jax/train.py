@@ -254,7 +254,7 @@ def train_step(
     norm = optax.global_norm(gradient)
     finite, fitting = jnp.isfinite(norm) & jnp.isfinite(loss), fits(limits, demands)
     update, optimizer = make_optimizer(config).update(gradient, state.optimizer, params)
-    trained = optax.apply_updates(params, update)
+    trained: Any = optax.apply_updates(params, update)
     fresh = {part: trained[part] | new_moments[part] for part in trained}
     usable = finite & fitting
     variables, optimizer = jax.tree.map(

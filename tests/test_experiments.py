@@ -14,7 +14,20 @@ from experiments import ao_train
 from ginn_jax.errors import InputError
 
 ROOT = Path(__file__).parents[1]
-KEYS = ["mse_3d", "relative_mse_3d", "noise_floor_3d", "equal_rays", "mse_2d", "dssim_2d", "seconds_total", "seconds_data", "seconds_compile", "seconds_train", "steps", "unseen_shapes"]
+KEYS = (
+    "mse_3d",
+    "relative_mse_3d",
+    "noise_floor_3d",
+    "equal_rays",
+    "mse_2d",
+    "dssim_2d",
+    "seconds_total",
+    "seconds_data",
+    "seconds_compile",
+    "seconds_train",
+    "steps",
+    "unseen_shapes",
+)
 SMALL = ao_train.Options(
     shapes=2,
     test_shapes=3,

@@ -316,13 +316,18 @@ def test_empty_neighbourhoods_are_zero_with_their_gradients(dense_case, variant,
 
 @VARIANTS
 @MIXES
+@pytest.mark.parametrize("first", [False, True])
 def test_padding_contributes_nothing_to_values_and_gradients(
-    dense_case, variant, mixes
+    dense_case, variant, mixes, first
 ):
-    """Whatever stands in masked rows, row 0 among them, results are bit-equal."""
+    """Results are bit-equal whatever masked rows hold, with and without row 0 in use.
+
+    Row 0 is what padded edges name as their sender.
+    """
     results = []
     for garbage in (0.0, 0.5, -1e6):
-        mask = dense_case.senders.mask & (np.arange(POINTS) > 0)
+        mask = np.array(dense_case.senders.mask)
+        mask[0] = first
         rows = np.where(mask[:, None], 1, 0)
         position, normal, features = (
             np.where(rows, a, garbage).astype(np.float32)
