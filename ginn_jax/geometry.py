@@ -6,7 +6,7 @@ demand under the same name, so a caller can tell which limit to raise.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ from ginn_jax.mcconv import (
 )
 from ginn_jax.voxels import EdgeLimit, Edges, VoxelGrid, build_grid, radius_edges
 
-Demands = dict[str, Int[Array, ""]]
+Demands = dict[str, Int[Any, ""]]
 
 
 @dataclass(frozen=True)

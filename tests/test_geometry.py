@@ -231,15 +231,14 @@ def test_limits_that_are_too_small_are_named(shallow, names):
 
 
 @pytest.mark.parametrize("start", [100, 1 << 14])
-def test_measured_limits_fit(start):
+@pytest.mark.parametrize("sizes", [(700, 1000), (1000, 700), (5, 4000)])
+def test_measured_limits_fit(start, sizes):
     """From limits that are too small, and from generous ones."""
-    clouds = [CLOUD._replace(position=CLOUD.position * s) for s in (0.7, 1.0)]
     tried = []
 
     def probe(limits, i):
         tried.append((i, limits))
-        cloud = jax.tree.map(jnp.asarray, clouds[i])
-        return as_jax(demands_by_hand(cloud, limits))
+        return as_jax(demands_by_hand(sizes[i], limits))
 
     first = ge.uniform_limits(SHALLOW, start)
     limits = ge.measure_limits(first, probe, 2, slack=1.0)
@@ -248,10 +247,9 @@ def test_measured_limits_fit(start):
         assert ge.exceeded(limits, probe(limits, i)) == {}
 
 
-def demands_by_hand(cloud, limits):
+def demands_by_hand(size, limits):
     """Demands that, as real ones, are known only as far as limits reach."""
-    size = float(np.abs(cloud.position).max())
-    demands = {name: int(300 * size + i) for i, name in enumerate(dict(limits.sizes))}
+    demands = {name: size + i for i, name in enumerate(dict(limits.sizes))}
     for name in demands:
         if name.endswith("edges"):
             candidates = name.replace("edges", "candidates")
