@@ -144,7 +144,7 @@ def test_non_finite_coordinate_is_one_line(value):
         nb.find_neighbors(good, bad, 0.1)
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(padded(), padded(QUERIES), RADII)
 def test_jitted_search_equals_brute_force_but_for_rounding(points, queries, radius):
     edges = edges_of(points, queries, radius)
