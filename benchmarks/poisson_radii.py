@@ -34,7 +34,6 @@ from ginn_jax.geometry import (
     build_query_field,
     limit_names,
     measure_limits,
-    uniform_limits,
 )
 from ginn_jax.image import (
     BLOCK,
@@ -123,7 +122,7 @@ def load_model(folder: Path | None) -> Model:
     if folder is None:
         network = architecture.DEFAULT
         config = Training(network, steps=1, batch_size=1, points=64, queries=64)
-        state = init_state(config, uniform_limits(network, 64))
+        state = init_state(config)
         return Model(network, state.variables, scenes.Occlusion.radius)
     config, _, variables = load_weights(folder)
     record = json.loads((folder / "run.json").read_text())

@@ -145,7 +145,7 @@ def profile(
     config: Training, limits: Limits, batch: ShadedPoints, repeats: int
 ) -> dict[str, Any]:
     """Seconds that each stage adds, and the share of geometry in the whole step."""
-    fresh = init_state(config, limits)
+    fresh = init_state(config)
     calls = {s: stage_call(config, limits, s, fresh, batch) for s in STAGES}
     timings = measure(calls, repeats)
     if not bool(calls["step"]()[1].fits):

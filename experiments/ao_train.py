@@ -61,7 +61,7 @@ class Options:
     """Layer table: ours, the paper's, or the authors' release."""
     schedule: Literal["cosine", "paper"] = "cosine"
     """Learning rate: warm-up and cosine decay, or the paper's x0.7 every 10 epochs."""
-    steps: int = 1600
+    steps: int = 3000
     """Training steps."""
     batch: int = 2
     """Clouds per step (the paper: 8)."""

@@ -130,7 +130,7 @@ def compact_network(
     levels: tuple[float, ...] = (0.02, 0.05, 0.1),
     within: float = 2.5,
     between: float = 1.5,
-    query_radius: float = 0.05,
+    query_radius: float = 0.035,
     latent: int = 16,
     **more,
 ) -> Network:

@@ -13,7 +13,7 @@ from jax.sharding import SingleDeviceSharding
 
 from ginn_jax.architecture import Conv, Network
 from ginn_jax.errors import InputError
-from ginn_jax.geometry import Limits
+from ginn_jax.geometry import Limits, limit_names
 from ginn_jax.network import Variables
 from ginn_jax.train import Training, TrainState, state_shapes
 
@@ -106,7 +106,14 @@ def load_run(folder: Path, config: Training, extra: dict[str, Any]) -> Limits:
             raise InputError(
                 f"{path} was made with another {name}: resume with the same"
             )
+    _check_names(path, config.network, limits)
     return limits
+
+
+def _check_names(path: Path, network: Network, limits: Limits) -> None:
+    """Raise `InputError` unless these are the capacities that the network needs."""
+    if {name for name, _ in limits.sizes} != set(limit_names(network)):
+        raise InputError(f"{path} is of another version of ginn_jax: train again")
 
 
 def load_weights(folder: Path) -> tuple[Training, Limits, Variables]:
@@ -124,10 +131,11 @@ def load_weights(folder: Path) -> tuple[Training, Limits, Variables]:
         raise InputError(f"{folder} holds no run: name the --out of one") from None
     except (ValueError, KeyError, AttributeError, TypeError):
         raise InputError(f"{path} is damaged: train again") from None
+    _check_names(path, config.network, limits)
     here = SingleDeviceSharding(jax.devices()[0])
     like = jax.tree.map(
         lambda s: jax.ShapeDtypeStruct(s.shape, s.dtype, sharding=here),
-        state_shapes(config, limits),
+        state_shapes(config),
     )
     with closing(open_manager(folder)) as manager:
         state = restore_state(manager, like)

@@ -35,7 +35,7 @@ from ginn_jax.train import (
 )
 
 PROBES = 300
-PROBE_SLACK = 1.25
+PROBE_SLACK = 1.1
 RAISE_SLACK = 1.25
 
 
@@ -86,7 +86,7 @@ def fit(
         limits = training_limits(config, clouds)
         save_run(folder, config, limits, extra or {})
     manager = open_manager(folder, fresh=not resume)
-    state = init_state(config, limits)
+    state = init_state(config)
     losses = np.zeros(0, np.float32)
     if resume and (found := restore_state(manager, state)) is not None:
         state, losses = found, load_losses(folder, int(found.step))

@@ -23,7 +23,8 @@ from ginn_jax.mcconv import (
     point_area,
     surface_weight,
 )
-from ginn_jax.voxels import EdgeLimit, Edges, VoxelGrid, build_grid, radius_edges
+from ginn_jax.packets import Demand, EdgeLimit, Edges, radius_edges
+from ginn_jax.voxels import VoxelGrid, build_grid
 
 Demands = dict[str, Int[Any, ""]]
 
@@ -85,26 +86,31 @@ def limit_names(config: Network) -> tuple[str, ...]:
     names = [
         f"level_{i}.{part}"
         for i in range(len(config.levels))
-        for part in ("candidates", "edges", "points")
+        for part in (*Demand._fields, "points")
     ]
     for conv in (*config.encoder, config.query):
         if conv is not config.query and transposed(config, conv):
             continue
-        names += [f"{conv.name}.candidates", f"{conv.name}.edges"]
+        names += [f"{conv.name}.{part}" for part in Demand._fields]
         names += [f"{conv.name}.pairs"] if config.density == "kde" else []
     return tuple(names)
 
 
 def uniform_limits(config: Network, size: int) -> Limits:
-    """The same capacity for everything: where measuring starts."""
-    return Limits(tuple((name, size) for name in limit_names(config)))
+    """The same capacity for everything (a word is worth many): to start measuring."""
+    return Limits(
+        tuple(
+            (name, max(size // 64, 64) if name.endswith(".words") else size)
+            for name in limit_names(config)
+        )
+    )
 
 
 def search(
     conv: Conv, limits: Limits, grid: VoxelGrid, receivers: Oriented
 ) -> tuple[Edges, Demands]:
     """Edges of one convolution and their demands; `grid` holds the senders."""
-    names = [f"{conv.name}.{part}" for part in ("candidates", "edges")]
+    names = [f"{conv.name}.{part}" for part in Demand._fields]
     limit = EdgeLimit(*(limits.of(name) for name in names))
     edges = radius_edges(
         grid, receivers.position, receivers.mask, jnp.float32(conv.radius), limit
@@ -147,7 +153,8 @@ def receptive_field(
         )
     else:
         weight = surface_weight(area, edges, receivers.mask.shape[0], radius)
-    return Field(edges.sender, edges.receiver, inputs, weight), demands
+    count = edges.demand.edges
+    return Field(edges.sender, edges.receiver, inputs, weight, count), demands
 
 
 def build_geometry(
@@ -163,7 +170,7 @@ def build_geometry(
             count = levels[conv.source].mask.shape[0]
             found[conv.name] = turn_edges(found[twin], receivers.mask.shape[0], count)
             continue
-        grid = grid_of(grids, conv.source, levels[conv.source], conv.radius)
+        grid = grid_of(config, grids, conv.source, levels[conv.source])
         found[conv.name], more = search(conv, limits, grid, receivers)
         demands |= more
     areas = _level_areas(config, levels, found)
@@ -174,22 +181,19 @@ def build_geometry(
             config, conv, limits, *ends, found[conv.name], areas.get(conv.source)
         )
         demands |= more
-    grid = grid_of(grids, 0, levels[0], config.query.radius)
+    grid = grid_of(config, grids, 0, levels[0])
     return Geometry(levels, finest, fields, areas.get(0), grid), demands
 
 
 def grid_of(
-    grids: dict[tuple[int, float], VoxelGrid],
-    level: int,
-    points: Oriented,
-    radius: float,
+    config: Network, grids: dict[int, VoxelGrid], level: int, points: Oriented
 ) -> VoxelGrid:
-    """The grid of a level (-1: the cloud) and a radius, built when first asked."""
-    if (level, radius) not in grids:
-        grids[level, radius] = build_grid(
-            points.position, points.mask, jnp.float32(radius)
-        )
-    return grids[level, radius]
+    """The grid of a level (-1: the cloud), built when first asked for."""
+    if level not in grids:
+        radii = [c.radius for c in (*config.encoder, config.query) if c.source == level]
+        cell = min(radii, default=2 * config.levels[0])
+        grids[level] = build_grid(points.position, points.mask, jnp.float32(cell))
+    return grids[level]
 
 
 def transposed(config: Network, conv: Conv) -> str | None:
@@ -213,23 +217,23 @@ def _build_levels(
     config: Network, limits: Limits, cloud: Oriented, key: Key[Array, ""]
 ) -> tuple[
     tuple[Oriented, ...],
-    dict[tuple[int, float], VoxelGrid],
+    dict[int, VoxelGrid],
     Int[Array, "N"],
     Demands,
 ]:
     """The Poisson disk hierarchy of a cloud, and which points make its finest level."""
-    grids: dict[tuple[int, float], VoxelGrid] = {}
+    grids: dict[int, VoxelGrid] = {}
     levels: list[Level] = []
     demands: Demands = {}
     points = cloud
     for i, radius in enumerate(config.levels):
-        names = [f"level_{i}.{part}" for part in ("candidates", "edges", "points")]
-        candidates, edges, kept = (limits.of(name) for name in names)
+        names = [f"level_{i}.{part}" for part in (*Demand._fields, "points")]
+        *searched, kept = (limits.of(name) for name in names)
         level, demand = build_level(
-            grid_of(grids, i - 1, points, radius),
+            grid_of(config, grids, i - 1, points),
             *points,
             jnp.float32(radius),
-            LevelLimit(EdgeLimit(candidates, edges), kept),
+            LevelLimit(EdgeLimit(*searched), kept),
             key=jax.random.fold_in(key, i),
         )
         demands |= dict(zip(names, (*demand.search, demand.points), strict=True))

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from ginn_jax.neighbors import bucket, find_neighbors
-from ginn_jax.voxels import Demand, EdgeLimit, VoxelGrid, compact, radius_edges
+from ginn_jax.packets import Demand, EdgeLimit, radius_edges
+from ginn_jax.voxels import VoxelGrid, compact
 
 WAITING, DROPPED, KEPT = 1, 0, 2
 
@@ -94,9 +95,9 @@ def draw_lots(count: int, *, key: Key[Array, ""]) -> UInt32[Array, "N"]:
 
 def beats(
     lot: UInt32[Any, "N"],
-    first: Int[Any, "E"],
-    second: Int[Any, "E"],
-) -> Bool[Any, "E"]:
+    first: Int[Any, "..."],
+    second: Int[Any, "..."],
+) -> Bool[Any, "..."]:
     """Whether point `first` is thrown before point `second`."""
     tie = (lot[first] == lot[second]) & (first < second)
     return (lot[first] < lot[second]) | tie

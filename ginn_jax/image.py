@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
@@ -26,9 +27,11 @@ from ginn_jax.geometry import (
 from ginn_jax.mcconv import Oriented
 from ginn_jax.neighbors import bucket, pad_rows
 from ginn_jax.network import Encoder, Shader, Variables
-from ginn_jax.voxels import VoxelGrid
+from ginn_jax.process import ALONE
+from ginn_jax.upsample import Surface, sample_pixels, upsample
+from ginn_jax.voxels import VoxelGrid, morton_order
 
-BLOCK = 1 << 15
+BLOCK = 1 << 14
 SLACK = 1.25
 
 
@@ -49,6 +52,8 @@ def encode(
     key: Key[Array, ""],
 ) -> tuple[Encoded, Demands]:
     """f_3D with all its geometry."""
+    order = morton_order(cloud.position, cloud.mask)
+    cloud = jax.tree.map(lambda a: a[order], cloud)
     geometry, demands = build_geometry(network, limits, cloud, key=key)
     codes: Any = Encoder(network, train=False).apply(
         variables["encoder"], geometry.levels[0].normal, geometry
@@ -64,18 +69,21 @@ def shade(
     encoded: Encoded,
     queries: Oriented,
 ) -> tuple[Float[Array, "M"], Demands]:
-    """f_2D with its search, for one block of queries."""
+    """f_2D with its search, for one block of queries in any order."""
+    order = morton_order(queries.position, queries.mask)
+    queries = jax.tree.map(lambda a: a[order], queries)
     field, demands = build_query_field(
         network, limits, encoded.points, encoded.grid, encoded.area, queries
     )
     values: Any = Shader(network, train=False).apply(
         variables["shader"], encoded.codes, queries.normal, queries.mask, field
     )
-    return values, demands
+    return jnp.zeros_like(values).at[order].set(values), demands
 
 
 _encode = jax.jit(encode, static_argnums=(0, 1))
-_shade = jax.jit(shade, static_argnums=(0, 1))
+_shade = jax.jit(shade, static_argnums=(0, 1), compiler_options=ALONE)
+_upsample = jax.jit(upsample)
 
 
 def encode_cloud(
@@ -129,31 +137,26 @@ def shade_points(
 ) -> tuple[Float[np.ndarray, "M"], Limits]:
     """Values at any points, in blocks over all devices; the limits that sufficed."""
     copies = [jax.device_put((variables, encoded), d) for d in jax.devices()]
+    size = min(BLOCK, bucket(len(position)))
     while True:
         parts, demands = [], []
         flat = _only(limits, network.query.name)
-        for number, first in enumerate(range(0, len(position), BLOCK)):
-            block = slice(first, first + BLOCK)
-            padded, mask = pad_rows(np.asarray(position[block], np.float32), BLOCK)
-            turned, _ = pad_rows(np.asarray(normal[block], np.float32), BLOCK)
-            values, demand = _shade(
-                network,
-                flat,
-                *copies[number % len(copies)],
-                Oriented(padded, turned, mask),
-            )
+        for number, first in enumerate(range(0, len(position), size)):
+            block = slice(first, first + size)
+            place, mask = pad_rows(np.asarray(position[block], np.float32), size)
+            turned, _ = pad_rows(np.asarray(normal[block], np.float32), size)
+            queries = Oriented(place, turned, mask)
+            arrays = copies[number % len(copies)]
+            values, demand = _shade(network, flat, *arrays, queries)
             parts.append(values)
             demands.append(demand)
-        if not parts:
-            return np.zeros(0, np.float32), limits
         short: dict[str, int] = {}
-        for demand in demands:
+        for demand in jax.device_get(demands):
             for name, need in exceeded(limits, demand).items():
                 short[name] = max(need, short.get(name, 0))
         if not short:
-            return np.concatenate([np.asarray(p) for p in parts])[
-                : len(position)
-            ], limits
+            values = [np.asarray(part) for part in parts] or [np.zeros(0, np.float32)]
+            return np.concatenate(values)[: len(position)], limits
         limits = raise_limits(limits, short, SLACK)
 
 
@@ -166,14 +169,38 @@ def shade_image(
     normal: Float[np.ndarray, "H W 3"],
     mask: Bool[np.ndarray, "H W"],
     background: float = 1.0,
+    resolution_scale: float = 1.0,
 ) -> tuple[Float[np.ndarray, "H W"], Limits]:
-    """An image of openness in [0, 1]; only the pixels in `mask` are computed."""
-    values, limits = shade_points(
-        network, limits, variables, encoded, position[mask], normal[mask]
-    )
-    image = np.full(mask.shape, background, np.float32)
-    image[mask] = as_openness(values)
-    return image, limits
+    """An image of openness in [0, 1]; only the pixels in `mask` are computed.
+
+    Below a `resolution_scale` of 1 fewer are: the others are interpolated inside their
+    own surface, and computed where that is not possible (see `upsample`).
+
+    Raises:
+        InputError: a resolution scale outside (0, 1].
+    """
+    if not 0 < resolution_scale <= 1:
+        raise InputError(f"resolution scale {resolution_scale}: give it in (0, 1]")
+    values, wanted = np.full(mask.shape, background, np.float32), mask
+    surface = Surface(position, normal, mask)
+
+    def shade(pixels: Bool[np.ndarray, "H W"], limits: Limits) -> Limits:
+        ends = position[pixels], normal[pixels]
+        found, limits = shade_points(network, limits, variables, encoded, *ends)
+        values[pixels] = as_openness(found)
+        return limits
+
+    if resolution_scale < 1:
+        rows, columns = (sample_pixels(n, resolution_scale) for n in mask.shape)
+        sampled = np.zeros_like(mask)
+        sampled[np.ix_(rows, columns)] = mask[np.ix_(rows, columns)]
+        limits = shade(sampled, limits)
+        coarse, thickness = values[np.ix_(rows, columns)], 0.2 * network.query.radius
+        between, known = _upsample(coarse, rows, columns, surface, thickness)
+        between, known = np.asarray(between), np.asarray(known) & ~sampled
+        values[known] = between[known]
+        wanted = mask & ~known & ~sampled
+    return values, shade(wanted, limits)
 
 
 def as_openness(values: Float[np.ndarray, "*P"]) -> Float[np.ndarray, "*P"]:

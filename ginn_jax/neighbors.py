@@ -3,18 +3,38 @@
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ginn_jax.errors import InputError
+from ginn_jax.packets import (
+    PACKET,
+    Candidates,
+    Columns,
+    Words,
+    count_words,
+    list_bits,
+    packet_candidates,
+    packet_columns,
+    packet_words,
+)
 from ginn_jax.process import available_cores
-from ginn_jax.voxels import Runs, VoxelGrid, build_grid, expand_runs, find_runs
+from ginn_jax.voxels import VoxelGrid, build_grid, morton_order
 
-QUERY_BLOCK = 1 << 16
-CANDIDATE_BLOCK = 1 << 21
+QUERY_BLOCK = 1 << 17
+WORD_BLOCK = 1 << 16
+
+
+class Pairs(NamedTuple):
+    """Pairs of some queries, sorted by query."""
+
+    query: Int[np.ndarray, "E"]
+    point: Int[np.ndarray, "E"]
+    squared: Float[np.ndarray, "E"]
 
 
 def find_neighbors(
@@ -24,8 +44,9 @@ def find_neighbors(
 ) -> tuple[Int[np.ndarray, "E"], Int[np.ndarray, "E"]]:
     """Host-level search: (query_index, point_index) of all pairs closer than `radius`.
 
-    Sorted by query. Sizes itself: one pass counts candidates, queries are then taken in
-    blocks of bounded size. Pairs within rounding of the radius are decided in float64.
+    Sorted by query. Sizes itself: every stage gets the capacity that the one before it
+    counted, and queries are taken in blocks. Pairs within rounding of the radius are
+    decided in float64.
 
     Raises:
         InputError: a shape other than [n, 3], a non-finite number, a radius <= 0.
@@ -37,15 +58,26 @@ def find_neighbors(
         return np.zeros(0, np.int32), np.zeros(0, np.int32)
     center = 0.5 * (points.min(0) + points.max(0))
     near_points = np.asarray(points - center, np.float32)
-    near_queries = np.asarray(queries - center, np.float32)
+    padded, mask = pad_rows(near_points, bucket(len(points)))
+    grid = _build_grid(padded, mask, np.float32(radius))
     # Twice the rounding of the largest coordinate, for three axes and both ends.
     rounding = 2e-6 * radius + 8 * np.finfo(np.float32).eps * np.abs(near_points).max()
-    found = _search_blocks(near_points, near_queries, np.float32(radius + rounding))
-    query_index, point_index, squared = found
-    doubtful = np.flatnonzero(squared > max(radius - 2 * rounding, 0.0) ** 2)
-    offset = points[point_index[doubtful]] - queries[query_index[doubtful]]
-    wrong = doubtful[np.sum(offset**2, axis=-1) >= radius**2]
-    return np.delete(query_index, wrong), np.delete(point_index, wrong)
+    reach = np.float32(radius + rounding)
+    certain = max(float(radius - 2 * rounding), 0.0) ** 2
+
+    def search(first: int) -> list[Pairs]:
+        block = queries[first : first + QUERY_BLOCK]
+        near = np.asarray(block - center, np.float32)
+        found = _search_block(grid, near, reach, first)
+        return [_decide(pairs, points, queries, radius, certain) for pairs in found]
+
+    with ThreadPoolExecutor(available_cores()) as pool:
+        blocks = pool.map(search, range(0, len(queries), QUERY_BLOCK))
+        parts = [pairs for block in blocks for pairs in block]
+    query_index, point_index = (
+        np.concatenate([pairs[column] for pairs in parts]) for column in (0, 1)
+    )
+    return query_index, point_index
 
 
 def as_points(name: str, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
@@ -70,76 +102,91 @@ def pad_rows(array: np.ndarray, rows: int) -> tuple[np.ndarray, np.ndarray]:
     return np.pad(array, missing), np.arange(rows) < len(array)
 
 
-Found = tuple[np.ndarray, np.ndarray, np.ndarray]
+def _search_block(
+    grid: VoxelGrid, queries: Float[np.ndarray, "M 3"], radius: np.float32, first: int
+) -> Iterator[Pairs]:
+    """The pairs of a block of queries; a block with too much to list is halved."""
+    rows = -(-bucket(len(queries)) // PACKET) * PACKET
+    padded, mask = pad_rows(queries, rows)
+    turned = _turn(padded, mask)
+    under, columns = _columns(grid, *turned[:2], radius)
+    size = bucket(4 * rows)
+    near, need = _candidates(grid, under, bucket(int(columns)), size)
+    if int(need) > size:
+        size = bucket(int(need))
+        near, need = _candidates(grid, under, bucket(int(columns)), size)
+    lists = int(count_words(near))
+    if lists > WORD_BLOCK and len(queries) > PACKET:
+        half = len(queries) // 2
+        yield from _search_block(grid, queries[:half], radius, first)
+        yield from _search_block(grid, queries[half:], radius, first + half)
+        return
+    words, edges = _words(grid, *turned, radius, near, bucket(lists))
+    count = int(edges)
+    pairs = _list(grid, padded, near, words, bucket(count))
+    receiver, sender, squared = (np.asarray(a)[:count] for a in pairs)
+    yield Pairs(first + receiver, sender, squared)
 
 
-def _search_blocks(
+def _decide(
+    pairs: Pairs,
     points: Float[np.ndarray, "N 3"],
     queries: Float[np.ndarray, "M 3"],
-    radius: np.float32,
-) -> Found:
-    """Query index, point index and squared distance of all pairs within the radius."""
-    padded, mask = pad_rows(points, bucket(len(points)))
-    grid = _build_grid(padded, mask, radius)
-
-    def search(first: int) -> list[Found]:
-        return _search_block(grid, queries[first : first + QUERY_BLOCK], first, radius)
-
-    with ThreadPoolExecutor(available_cores()) as pool:
-        blocks = list(pool.map(search, range(0, len(queries), QUERY_BLOCK)))
-    columns = zip(*(part for block in blocks for part in block), strict=True)
-    query_index, point_index, squared = (np.concatenate(column) for column in columns)
-    return query_index, point_index, squared
+    radius: float,
+    certain: float,
+) -> Pairs:
+    """Without the pairs that float64 finds to be as far apart as the radius."""
+    doubtful = np.flatnonzero(pairs.squared > certain)
+    offset = points[pairs.point[doubtful]] - queries[pairs.query[doubtful]]
+    wrong = doubtful[np.sum(offset**2, axis=-1) >= radius**2]
+    if not len(wrong):
+        return pairs
+    return Pairs(*(np.delete(column, wrong) for column in pairs))
 
 
-def _search_block(
-    grid: VoxelGrid, queries: Float[np.ndarray, "M 3"], first: int, radius: np.float32
-) -> list[Found]:
-    """The pairs of a block of queries; a block too dense to number is halved."""
-    query, query_mask = pad_rows(queries, bucket(len(queries)))
-    runs = _find_runs(grid, query, query_mask, radius)
-    total = int(np.sum(np.asarray(runs.length), dtype=np.int64))
-    if total > 1 << 30 and len(queries) > 1:
-        half = len(queries) // 2
-        return [
-            *_search_block(grid, queries[:half], first, radius),
-            *_search_block(grid, queries[half:], first + half, radius),
-        ]
-    return [
-        (first + receiver, sender, squared)
-        for receiver, sender, squared in _test_blocks(grid, query, runs, radius, total)
-    ]
+@partial(jax.jit, static_argnames=("columns", "capacity"))
+def _candidates(
+    grid: VoxelGrid, under: Columns, columns: int, capacity: int
+) -> tuple[Candidates, Int[Array, ""]]:
+    return packet_candidates(grid, under, columns, capacity)
 
 
-def _test_blocks(
-    grid: VoxelGrid,
-    query: Float[np.ndarray, "M 3"],
-    runs: Runs,
-    radius: np.float32,
-    total: int,
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Test candidates block by block; keep receiver, sender, squared distance."""
-    capacity = min(CANDIDATE_BLOCK, bucket(total))
-    for first in range(0, max(total, 1), capacity):
-        tested = _test_candidates(grid, query, runs, np.int32(first), capacity)
-        receiver, sender, squared = map(np.asarray, tested)
-        keep = np.flatnonzero(squared < radius**2)
-        yield receiver[keep], sender[keep], squared[keep]
+@jax.jit
+def _turn(
+    query: Float[Array, "M 3"], mask: Bool[Array, "M"]
+) -> tuple[Float[Array, "M 3"], Bool[Array, "M"], Int[Array, "M"]]:
+    """Queries along a space-filling curve, which of them are real, their numbers."""
+    order = morton_order(query, mask)
+    return query[order], mask[order], order
 
 
 @partial(jax.jit, static_argnames="capacity")
-def _test_candidates(
+def _words(
     grid: VoxelGrid,
     query: Float[Array, "M 3"],
-    runs: Runs,
-    first: Int[Array, ""],
+    mask: Bool[Array, "M"],
+    number: Int[Array, "M"],
+    radius: Float[Array, ""],
+    near: Candidates,
     capacity: int,
-) -> tuple[Int[Array, "K"], Int[Array, "K"], Float[Array, "K"]]:
-    """Receiver, sender and squared distance of a block; infinite where padded."""
-    (receiver, row, valid), _ = expand_runs(runs, capacity, first)
-    squared = jnp.sum((query[receiver] - grid.position[row]) ** 2, axis=-1)
-    return receiver, grid.index[row], jnp.where(valid, squared, jnp.inf)
+) -> tuple[Words, Int[Array, ""]]:
+    words = packet_words(grid, query, mask, radius, near, capacity, number=number)
+    return words, jnp.sum(jax.lax.population_count(words.word).astype(jnp.int32))
+
+
+@partial(jax.jit, static_argnames="capacity")
+def _list(
+    grid: VoxelGrid,
+    query: Float[Array, "M 3"],
+    near: Candidates,
+    words: Words,
+    capacity: int,
+) -> tuple[Int[Array, "E"], Int[Array, "E"], Float[Array, "E"]]:
+    """Query, point and squared distance of every pair; `query` by number."""
+    (row, receiver, _), _ = list_bits(words, near, capacity)
+    offset = query[receiver] - grid.position[row]
+    return receiver, grid.index[row], jnp.sum(offset**2, axis=-1)
 
 
 _build_grid = jax.jit(build_grid)
-_find_runs = jax.jit(find_runs)
+_columns = jax.jit(packet_columns)

@@ -60,7 +60,7 @@ class McConv(nn.Module):
         kernel = self.param(
             "kernel",
             lambda key: init_kernel(
-                field.inputs.shape[1],
+                field.inputs.shape[0],
                 kernels,
                 config.hidden,
                 config.group or kernels,

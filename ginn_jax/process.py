@@ -5,6 +5,10 @@ import os
 
 import jax
 
+# Compiler options of what runs on several devices at once: with a device on every core
+# none has another to share a kernel with.
+ALONE = {"xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
+
 # glibc's mallopt parameters, from malloc.h.
 TRIM_THRESHOLD, TOP_PAD, MMAP_MAX, ARENA_MAX = -1, -2, -4, -8
 

@@ -25,10 +25,12 @@ from ginn_jax.geometry import (
     build_geometry,
     build_query_field,
     fits,
+    uniform_limits,
 )
 from ginn_jax.mcconv import Field, Oriented
 from ginn_jax.network import Encoder, Shader, Variables
-from ginn_jax.voxels import compact
+from ginn_jax.process import ALONE
+from ginn_jax.voxels import compact, morton_order
 
 
 @dataclass(frozen=True)
@@ -111,9 +113,12 @@ def make_example(
         batch, jax.random.split(turn_key, clouds)
     )
     cloud = side_by_side(batch)
+    mask = jnp.ones(cloud.target.shape, bool)
+    order = morton_order(cloud.position, mask)
+    cloud = jax.tree.map(lambda a: a[order], cloud)
     network = config.network
     geometry, demands = build_geometry(network, limits, oriented(cloud), key=disk_key)
-    rows, mask = _left_over(geometry, clouds, config.points, config.queries)
+    rows, mask = _left_over(geometry, mask, clouds * config.queries)
     queries = Oriented(cloud.position[rows], cloud.normal[rows], mask)
     finest, grid, area = geometry.levels[0], geometry.grid, geometry.area
     field, more = build_query_field(network, limits, finest, grid, area, queries)
@@ -124,15 +129,15 @@ def make_example(
 
 
 def _left_over(
-    geometry: Geometry, clouds: int, points: int, queries: int
+    geometry: Geometry, mask: Bool[Array, "N"], queries: int
 ) -> tuple[Int[Array, "M"], Bool[Array, "M"]]:
-    """Rows of the first `queries` points of each cloud that are not in level 0."""
-    kept = jnp.zeros(clouds * points, bool)
-    finest = jnp.where(geometry.levels[0].mask, geometry.finest, kept.size)
-    free = ~kept.at[finest].set(True, mode="drop").reshape(clouds, points)
-    rows, mask, _ = jax.vmap(partial(compact, capacity=queries))(free)
-    rows += points * jnp.arange(clouds, dtype=jnp.int32)[:, None]
-    return rows.reshape(-1), mask.reshape(-1)
+    """Rows that are not in level 0, `queries` of them at even steps."""
+    finest = jnp.where(geometry.levels[0].mask, geometry.finest, mask.size)
+    free, _, total = compact(mask.at[finest].set(False, mode="drop"), mask.size)
+    number = jnp.arange(queries, dtype=jnp.int32)
+    step = jnp.maximum(total.astype(jnp.float32) / queries, 1.0)
+    place = ((number.astype(jnp.float32) + 0.5) * step).astype(jnp.int32)
+    return free[jnp.minimum(place, mask.size - 1)], number < total
 
 
 def infer(
@@ -232,7 +237,7 @@ def _share_gradient(
     return gradient, moments, loss, jax.lax.pmax(demands, "batch")
 
 
-@partial(jax.jit, static_argnums=(0, 1), donate_argnums=2)
+@partial(jax.jit, static_argnums=(0, 1), donate_argnums=2, compiler_options=ALONE)
 def train_step(
     config: Training, limits: Limits, state: TrainState, batch: ShadedPoints
 ) -> tuple[TrainState, StepReport]:
@@ -251,7 +256,7 @@ def train_step(
         out_specs=replicated,
         check_vma=False,
     )(params, moments, key, batch)
-    norm = optax.global_norm(gradient)
+    norm = optax.tree.norm(gradient)
     finite, fitting = jnp.isfinite(norm) & jnp.isfinite(loss), fits(limits, demands)
     update, optimizer = make_optimizer(config).update(gradient, state.optimizer, params)
     trained: Any = optax.apply_updates(params, update)
@@ -268,23 +273,21 @@ def train_step(
     return TrainState(variables, optimizer, step, skipped), report
 
 
-def init_state(config: Training, limits: Limits) -> TrainState:
+def init_state(config: Training) -> TrainState:
     """The state before the first step."""
-    zeros = jax.tree.map(
-        lambda s: jnp.zeros(s.shape, s.dtype), _example_shapes(config, limits)
-    )
+    zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), _example_shapes(config))
     key = jax.random.key(config.seed)
     variables = jax.jit(partial(init_variables, config.network))(zeros, key=key)
     return place(config, _first_state(config, variables))
 
 
-def state_shapes(config: Training, limits: Limits) -> TrainState:
+def state_shapes(config: Training) -> TrainState:
     """Shapes and types of a state, without any computation."""
     return jax.eval_shape(
         lambda example, key: _first_state(
             config, init_variables(config.network, example, key=key)
         ),
-        _example_shapes(config, limits),
+        _example_shapes(config),
         jax.random.key(0),
     )
 
@@ -295,8 +298,9 @@ def _first_state(config: Training, variables: Variables) -> TrainState:
     return TrainState(variables, optimizer, jnp.int32(0), jnp.int32(0))
 
 
-def _example_shapes(config: Training, limits: Limits) -> Example:
-    """Shapes of what a step computes from the clouds; capacities decide them."""
+def _example_shapes(config: Training) -> Example:
+    """Shapes of what a step computes from the clouds, in the smallest capacities."""
+    limits = uniform_limits(config.network, 64)
     rows = (config.batch_size, config.points)
     point, number = (
         jax.ShapeDtypeStruct((*rows, *more), jnp.float32) for more in ((3,), ())

@@ -1,46 +1,25 @@
-"""Radius search in a voxel hash of fixed capacity: jit-compatible, nothing dropped.
+"""Points in a voxel grid of fixed tables, and ranges of rows expanded to lists.
 
-Points are sorted by cell key. The cells are as wide as the radius across x and y and
-finer along z, so the neighbours of a query lie in at most 3 x 3 columns, and in each
-column in one contiguous run of the sorted order, found by binary search: no table,
-no bucket that could overflow, no hash collision. Runs are expanded to candidates by
-a prefix sum, candidates within the radius are compacted to edges by another.
+Points are sorted by column (a cell across x and y) and in a column by layer along z, so
+the points of a box are one contiguous run of rows in each column under it, found by
+binary search: no bucket that could overflow, no hash collision. Lists of variable
+length are made by prefix sums, in a capacity that the caller chose.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
-COLUMNS = 9
-TABLE = 1 << 16
-LAYERS = (1 << 31) // TABLE - 1
+TABLE = (1 << 16) - 1
+LAYERS = 1 << 15
 FINENESS = 8
-NO_KEY = np.iinfo(np.int32).max
-PairFilter = Callable[[Int[Array, "E"], Int[Array, "E"]], Bool[Array, "E"]]
-
-
-@dataclass(frozen=True)
-class EdgeLimit:
-    """Capacities of one search: candidates looked at, edges kept."""
-
-    candidates: int
-    edges: int
-
-
-class Demand(NamedTuple):
-    """What a search needed. `edges` is a lower bound if `candidates` overflowed."""
-
-    candidates: Int[Array, ""]
-    edges: Int[Array, ""]
+FINE_ENOUGH = 6
 
 
 class VoxelGrid(NamedTuple):
-    """Points sorted by column, then height; masked points come last.
+    """Points sorted by column, then layer; masked points come last.
 
     Rows `column_start[c] : column_start[c + 1]` lie in column c = x * shape[1] + y.
     """
@@ -54,46 +33,74 @@ class VoxelGrid(NamedTuple):
     shape: Int[Array, "3"]
 
 
-class Runs(NamedTuple):
-    """Per query and column, the run [start, start + length) of sorted points."""
-
-    start: Int[Array, "M 9"]
-    length: Int[Array, "M 9"]
-
-
-class Edges(NamedTuple):
-    """Pairs closer than the radius, `receiver` ascending; padding has receiver M."""
-
-    sender: Int[Array, "E"]
-    receiver: Int[Array, "E"]
-    demand: Demand
-
-
 def prefix_sum(counts: Int[Array, "K"]) -> Int[Array, "K"]:
     """Inclusive prefix sum of small non-negative counts."""
-    return jnp.cumsum(counts)
+    return jax.lax.platform_dependent(
+        counts, cpu=_running_sum, default=lambda counts: jnp.cumsum(counts)
+    )
+
+
+def _running_sum(counts: Int[Array, "K"]) -> Int[Array, "K"]:
+    """One sum after the other: on CPU twice as fast as XLA's tree, and one kernel."""
+    return jax.lax.scan(lambda total, n: (total + n,) * 2, jnp.int32(0), counts)[1]
 
 
 def saturating_sum(counts: Int[Array, "..."]) -> Int[Array, ""]:
     """Sum of counts that stops at the largest int32 instead of wrapping around."""
     wraps = jnp.sum(counts.astype(jnp.float32)) > 2.0**31 - 1024
-    return jnp.where(wraps, jnp.int32(NO_KEY), jnp.sum(counts))
+    return jnp.where(wraps, jnp.int32(2**31 - 1), jnp.sum(counts))
 
 
 def build_grid(
-    position: Float[Array, "N 3"], mask: Bool[Array, "N"], radius: Float[Array, ""]
+    position: Float[Array, "N 3"], mask: Bool[Array, "N"], cell: Float[Array, ""]
 ) -> VoxelGrid:
-    """Sort points by cell. Cells grow where the cloud has more than `TABLE` columns."""
+    """Sort points into columns `cell` wide; wider where the cloud has too many."""
     origin, extent = _bounds(position, mask)
-    cell = _cell_size(extent, radius)
-    shape = jnp.floor(extent / cell).astype(jnp.int32) + 1
-    x, y, layer = jnp.floor((position - origin) / cell).astype(jnp.int32).T
-    column = jnp.where(mask, x * shape[1] + y, TABLE)
-    key = jnp.where(mask, column * (LAYERS + 1) + layer, NO_KEY)
-    key, index = jax.lax.sort((key, jnp.arange(key.size, dtype=jnp.int32)), num_keys=1)
+    size = _cell_size(extent, cell)
+    shape = jnp.floor(extent / size).astype(jnp.int32) + 1
+    x, y, layer = jnp.floor((position - origin) / size).astype(jnp.int32).T
+    column = jnp.where(mask, x * shape[1] + y, TABLE).astype(jnp.uint32)
+    order = stable_order(jnp.where(mask, layer, 0).astype(jnp.uint32), 16)
+    order = order[stable_order(column[order], 16)]
     count = jnp.zeros(TABLE, jnp.int32).at[column].add(1, mode="drop")
     start = jnp.concatenate([jnp.zeros(1, jnp.int32), prefix_sum(count)])
-    return VoxelGrid(position[index], index, layer[index], start, origin, cell, shape)
+    return VoxelGrid(position[order], order, layer[order], start, origin, size, shape)
+
+
+def stable_order(key: UInt32[Array, "N"], bits: int) -> Int[Array, "N"]:
+    """Rows in ascending order of a key of so many bits, equal keys in order of row.
+
+    Key and row in one word where they fit: XLA sorts a single array several times
+    faster than two.
+    """
+    rows = jnp.arange(key.size, dtype=jnp.int32)
+    below = max(key.size - 1, 1).bit_length()
+    if bits + below > 32:
+        return jax.lax.sort((key, rows), num_keys=1)[1]
+    packed = jax.lax.sort((key << below) | rows.astype(jnp.uint32))
+    return (packed & jnp.uint32((1 << below) - 1)).astype(jnp.int32)
+
+
+def morton_order(
+    position: Float[Array, "N 3"], mask: Bool[Array, "N"]
+) -> Int[Array, "N"]:
+    """Rows along a space-filling curve, masked ones last: neighbours come together."""
+    origin, extent = _bounds(position, mask)
+    room = 31 - max(position.shape[0] - 1, 1).bit_length()
+    # One sort has room for so many bits; a large cloud wants finer cells than that.
+    bits = room // 3 if room // 3 >= FINE_ENOUGH else min(2 * room // 3, 10)
+    side = jnp.max(extent) / (1 << bits)
+    cell = jnp.floor((position - origin) / jnp.where(side > 0, side, 1.0))
+    cell = jnp.clip(cell, 0, (1 << bits) - 1).astype(jnp.uint32)
+    code = jnp.zeros(position.shape[0], jnp.uint32)
+    for bit in range(bits):
+        for axis in range(3):
+            code |= ((cell[:, axis] >> bit) & 1) << (3 * bit + axis)
+    code = jnp.where(mask, code, jnp.uint32(1 << (3 * bits)))
+    if 3 * bits <= room:
+        return stable_order(code, room)
+    order = stable_order(code & jnp.uint32((1 << room) - 1), room)
+    return order[stable_order(code[order] >> room, 3 * bits + 1 - room)]
 
 
 def _bounds(
@@ -107,26 +114,23 @@ def _bounds(
     return jnp.where(occupied, low, 0.0), jnp.where(occupied, high - low, 0.0)
 
 
-def _cell_size(
-    extent: Float[Array, "3"], radius: Float[Array, ""]
-) -> Float[Array, "3"]:
-    """Radius across x and y, finer along z, unless the tables would not hold them."""
+def _cell_size(extent: Float[Array, "3"], cell: Float[Array, ""]) -> Float[Array, "3"]:
+    """`cell` across x and y, finer along z, unless the tables would not hold them."""
     width, depth, height = extent
-    # 1.0001: rounding must not put two neighbours three columns apart.
     across = jnp.max(
         jnp.stack(
             [
-                1.0001 * radius,
-                2 * jnp.sqrt(width / TABLE) * jnp.sqrt(depth),
-                4 * jnp.maximum(width, depth) / TABLE,
+                cell,
+                2.01 * jnp.sqrt(width / TABLE) * jnp.sqrt(depth),
+                4.01 * jnp.maximum(width, depth) / TABLE,
             ]
         )
     )
-    along = jnp.maximum(radius / FINENESS, height / (LAYERS - 1))
+    along = jnp.maximum(cell / FINENESS, height / (LAYERS - 1))
     return jnp.stack([across, across, along])
 
 
-def _cell_of(
+def cell_of(
     grid: VoxelGrid, coordinate: Float[Array, "*K"], axis: int
 ) -> Int[Array, "*K"]:
     """Cell along one axis; -1 or `shape` where it lies outside. Monotone."""
@@ -135,47 +139,7 @@ def _cell_of(
     return jnp.clip(cell, -1.0, top).astype(jnp.int32)
 
 
-def find_runs(
-    grid: VoxelGrid,
-    query: Float[Array, "M 3"],
-    query_mask: Bool[Array, "M"],
-    radius: Float[Array, ""],
-) -> Runs:
-    """The 9 runs that hold every point closer than `radius` to each query.
-
-    A column at distance d across x and y is scanned only over z +- sqrt(r^2 - d^2).
-    """
-    x, y, z = query.T
-    column_x, gap_x, inside_x = _columns_beside(grid, x, 0, radius)
-    column_y, gap_y, inside_y = _columns_beside(grid, y, 1, radius)
-    room = (1.00001 * radius) ** 2 - gap_x[:, None] ** 2 - gap_y[None] ** 2
-    valid = inside_x[:, None] & inside_y[None] & (room > 0) & query_mask
-    column = jnp.where(valid, column_x[:, None] * grid.shape[1] + column_y[None], 0)
-    first = grid.column_start[column]
-    last = jnp.where(valid, grid.column_start[column + 1], first)
-    half = jnp.sqrt(jnp.maximum(room, 0.0))
-    low, high = _cell_of(grid, z - half, 2), _cell_of(grid, z + half, 2)
-    start, stop = _narrow(grid.layer, first, last, low, high + 1)
-    return Runs(*(a.reshape(COLUMNS, -1).T for a in (start, stop - start)))
-
-
-def _columns_beside(
-    grid: VoxelGrid, coordinate: Float[Array, "M"], axis: int, radius: Float[Array, ""]
-) -> tuple[Int[Array, "3 M"], Float[Array, "3 M"], Bool[Array, "3 M"]]:
-    """The 3 cells within reach along one axis, the gap to each, and which exist."""
-    reach = 1.00001 * radius
-    first = _cell_of(grid, coordinate - reach, axis)
-    last = _cell_of(grid, coordinate + reach, axis)
-    cell = first + jnp.arange(3, dtype=jnp.int32)[:, None]
-    inside = (cell >= 0) & (cell < grid.shape[axis]) & (cell <= last)
-    wall = grid.origin[axis] + cell.astype(jnp.float32) * grid.cell[axis]
-    # A relative slack: walls are rounded differently from the cells of points.
-    slack = 1e-5 * (radius + jnp.abs(coordinate) + jnp.abs(grid.origin[axis]))
-    outside = jnp.maximum(wall - coordinate, coordinate - wall - grid.cell[axis])
-    return cell, jnp.maximum(outside - slack, 0.0), inside
-
-
-def _narrow(
+def narrow_runs(
     layer: Int[Array, "N"],
     first: Int[Array, "*K"],
     last: Int[Array, "*K"],
@@ -209,34 +173,19 @@ class Expansion(NamedTuple):
 
 
 def expand_ranges(
-    start: Int[Array, "R"],
-    length: Int[Array, "R"],
-    capacity: int,
-    first: Int[Array, ""] | int = 0,
+    start: Int[Array, "R"], length: Int[Array, "R"], capacity: int
 ) -> tuple[Expansion, Int[Array, ""]]:
     """List rows start .. start + length of every range, and how many there are in all.
 
-    `capacity` slots are filled, from slot number `first` of the whole list on.
+    Slots that are not valid still name some range.
     """
     stop = prefix_sum(length)
     begin = stop - length
     total = saturating_sum(length)
-    earlier = jnp.sum(begin < first, dtype=jnp.int32)
-    slot = jnp.where(begin >= first, begin - first, capacity)
-    opened = jnp.zeros(capacity, jnp.int32).at[slot].add(1, mode="drop")
-    owner = earlier + prefix_sum(opened) - 1
-    number = first + jnp.arange(capacity, dtype=jnp.int32)
+    opened = jnp.zeros(capacity, jnp.int32).at[begin].add(1, mode="drop")
+    owner = prefix_sum(opened) - 1
+    number = jnp.arange(capacity, dtype=jnp.int32)
     return Expansion(owner, number + (start - begin)[owner], number < total), total
-
-
-def expand_runs(
-    runs: Runs, capacity: int, first: Int[Array, ""] | int = 0
-) -> tuple[Expansion, Int[Array, ""]]:
-    """Candidate pairs of all runs: `owner` is the query, `row` the sorted point."""
-    slots, total = expand_ranges(
-        runs.start.reshape(-1), runs.length.reshape(-1), capacity, first
-    )
-    return slots._replace(owner=slots.owner // COLUMNS), total
 
 
 def compact(
@@ -252,28 +201,3 @@ def compact(
     )
     total = rank[-1] if keep.size else jnp.int32(0)
     return index, jnp.arange(capacity, dtype=jnp.int32) < total, total
-
-
-def radius_edges(
-    grid: VoxelGrid,
-    query: Float[Array, "M 3"],
-    query_mask: Bool[Array, "M"],
-    radius: Float[Array, ""],
-    limit: EdgeLimit,
-    pair_filter: PairFilter | None = None,
-) -> Edges:
-    """Every (point, query) pair closer than `radius`, sorted by query.
-
-    `radius` must not exceed the one the grid was built for. `pair_filter(sender,
-    receiver)` may drop pairs. Where `demand` exceeds `limit`, edges are missing.
-    """
-    runs = find_runs(grid, query, query_mask, radius)
-    (receiver, row, valid), candidates = expand_runs(runs, limit.candidates)
-    offset = query[receiver] - grid.position[row]
-    keep = valid & (jnp.sum(offset**2, axis=-1) < radius**2)
-    if pair_filter is not None:
-        keep &= pair_filter(grid.index[row], receiver)
-    slot, real, edges = compact(keep, limit.edges)
-    sender = jnp.where(real, grid.index[row[slot]], 0)
-    receiver = jnp.where(real, receiver[slot], query.shape[0])
-    return Edges(sender, receiver, Demand(candidates, edges))

@@ -6,12 +6,12 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from ginn_jax.voxels import EdgeLimit
+from ginn_jax.packets import EdgeLimit
 
 POINTS, QUERIES = 32, 16
 RADII = st.sampled_from([0.25, 0.1, 1.0])
-# Enough for every pair that padded clouds can have.
-ALL_PAIRS = EdgeLimit(POINTS * POINTS, POINTS * POINTS)
+# Enough for every pair that padded clouds can have, and all columns of a grid.
+ALL_PAIRS = EdgeLimit(1 << 16, POINTS * POINTS, 64, POINTS * POINTS)
 SEEDS = st.integers(0, 2**31 - 1)
 UNIT = st.floats(-1, 1, width=32, allow_subnormal=False)
 # Multiples of the radii: on the faces of cells, and at exactly the radius.

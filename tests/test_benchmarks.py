@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 import tiny
 
-from benchmarks import neighbors, poisson_radii, timing, train_step
+from benchmarks import (
+    f2d,
+    mc_conv,
+    neighbors,
+    poisson_radii,
+    scaling,
+    timing,
+    train_step,
+)
 from ginn_jax import architecture
 from ginn_jax.commandline import hasten
 from ginn_jax.errors import InputError
@@ -140,6 +148,76 @@ def test_poisson_radii(tmp_path, monkeypatch, trained):
     assert ("3D MSE" in text) == trained
     assert ("Untrained" in text) != trained
     check_files(tmp_path / "out", "poisson_radii.png")
+
+
+def test_f2d(tmp_path, monkeypatch):
+    """Ours and the straightforward form agree, or `compare` raises."""
+    monkeypatch.setattr(f2d, "compact_network", lambda **_: tiny.NETWORK)
+    options = f2d.Options(
+        tmp_path, resolution=48, disks=(0.08,), radii=(0.16,), rays=(1,), repeats=1
+    )
+    case = f2d.main(options)["cases"][0]
+    assert case["difference"] < 1e-5
+    assert case["edges"] > case["pixels"] > 500
+    assert case["block_bytes"] > 0
+    assert set(case["timings"]) == {
+        "ours",
+        "ours, scale 0.5",
+        "straightforward",
+        "1 rays",
+    }
+    text = (tmp_path / "report.md").read_text()
+    assert "straightforward / ours" in text
+
+
+def test_mc_conv_without_peers(tmp_path, monkeypatch):
+    def absent(*_):
+        raise ImportError
+
+    monkeypatch.setattr(mc_conv, "in_torch", absent)
+    monkeypatch.setattr(mc_conv, "in_open3d", absent)
+    options = mc_conv.Options(tmp_path, points=200, radii=(0.2,), repeats=1)
+    metrics = mc_conv.main(options)
+    assert metrics["cases"][0]["missing"][0] == "PyTorch"
+    assert metrics["cases"][0]["edges"] > 200
+    assert "PyTorch" in (tmp_path / "report.md").read_text()
+
+
+def test_mc_conv_compares_with_a_peer():
+    """A stand-in peer: ours with the blocks of its kernel taken apart."""
+    options = mc_conv.Options(points=200)
+    points = mc_conv.uniform(np.random.default_rng(0), 200)
+    mine = mc_conv.ours(mc_conv.make_layer(options, 0.2, points))
+
+    def flat(wrong=0.0):
+        kernel, features = mine["gradient"]()
+        return [*(a[0] for a in kernel), features + wrong]
+
+    peer = {"forward": mine["forward"], "gradient": flat}
+    assert mc_conv.check(mine, peer) == 0
+    with pytest.raises(AssertionError, match="differ"):
+        mc_conv.check(mine, peer | {"gradient": lambda: flat(1.0)})
+
+
+def test_scaling(tmp_path, monkeypatch):
+    monkeypatch.setattr(scaling, "network_for", lambda _: tiny.NETWORK)
+    options = scaling.Options(
+        tmp_path, points=(600, 1200), resolutions=(32, 64), repeats=1
+    )
+    metrics = scaling.main(options)
+    sizes = [row["size"] for row in metrics["tables"]["pixels"]]
+    assert 3 < sizes[1] / sizes[0] < 5
+    assert len({row["scratch_mib"] for row in metrics["tables"]["pixels"]}) == 1
+    assert np.isfinite(list(metrics["slopes"].values())).all()
+    check_files(tmp_path, "scaling.png")
+
+
+def test_slope_of_a_power_law():
+    rows = [
+        {"size": n, "timing": timing.Timing(0.0, (3e-6 * n**1.5,))}
+        for n in (8, 64, 999)
+    ]
+    assert scaling.slope(rows) == pytest.approx(1.5)
 
 
 def test_mistakes_are_input_errors(tmp_path, monkeypatch):

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from ginn_jax import geometry as ge
 from ginn_jax.architecture import PRESETS, Network, compact_network, released_table
 from ginn_jax.mcconv import Oriented
-from ginn_jax.voxels import Demand, Edges
+from ginn_jax.packets import Demand, Edges
 
 RADIUS = 0.5
 LEVELS = (0.1, 0.25)
@@ -159,9 +159,9 @@ def test_inputs_point_from_sender_to_receiver(built):
         x = receivers.position[field.receiver[real]]
         y = geometry.levels[conv.source].position[field.sender[real]]
         np.testing.assert_allclose(
-            field.inputs[real, :3], (x - y) / np.float32(conv.radius), atol=1e-6
+            field.inputs.T[real, :3], (x - y) / np.float32(conv.radius), atol=1e-6
         )
-        assert not field.inputs[~real].any()
+        assert not field.inputs[:, ~real].any()
         assert not field.weight[~real].any()
         assert (field.weight[real] > 0).all()
 
@@ -281,7 +281,9 @@ def test_turned_edges_are_the_same_pairs(drawn):
     for row, (r, s) in enumerate(drawn):
         receiver[row], sender[row] = r, s
     need = jnp.int32(len(drawn))
-    edges = Edges(jnp.asarray(sender), jnp.asarray(receiver), Demand(need, need))
+    edges = Edges(
+        jnp.asarray(sender), jnp.asarray(receiver), Demand(need, need, need, need)
+    )
     turned = as_numpy(ge.turn_edges(edges, 5, 7))
     real = turned.receiver < 5
     assert (turned.receiver[~real] == 5).all()

@@ -1,5 +1,6 @@
 """Poisson disk sampling against sequential dart throwing."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -13,7 +14,7 @@ from strategies import ALL_PAIRS, POINTS, RADII, SEEDS, clouds, pad, padded
 
 from ginn_jax import hierarchy as hi
 from ginn_jax.errors import InputError
-from ginn_jax.voxels import EdgeLimit, build_grid
+from ginn_jax.voxels import build_grid
 
 NORMAL = np.arange(3.0 * POINTS, dtype=np.float32).reshape(POINTS, 3)
 FULL = hi.LevelLimit(ALL_PAIRS, POINTS)
@@ -154,7 +155,7 @@ def dense():
 
 def test_too_few_edges_are_told(dense):
     cloud, _, need = dense
-    short = EdgeLimit(ALL_PAIRS.candidates, int(need.search.edges) - 1)
+    short = replace(ALL_PAIRS, edges=int(need.search.edges) - 1)
     demand = level_of(cloud, 0.4, 0, hi.LevelLimit(short, POINTS))[1]
     assert demand.search == need.search
 

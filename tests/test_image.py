@@ -217,3 +217,41 @@ def test_disk_radius_beyond_level_1_is_refused():
     network = replace(tiny.NETWORK, levels=(0.08, 0.1))
     with pytest.raises(InputError, match=r"exceeds level 1's 0\.1"):
         image.with_disk_radius(network, 0.12)
+
+
+def ground_picture():
+    """Level ground seen from above, a pixel .02 wide, a strip of it missing."""
+    x, z = np.meshgrid(np.linspace(-0.3, 0.3, 32), np.linspace(-0.3, 0.3, 30))
+    position = np.stack([x, np.zeros_like(x), z], axis=-1).astype(np.float32)
+    normal = np.broadcast_to(np.array([0, 1, 0], np.float32), position.shape)
+    return position, normal, np.abs(x - 0.11) > 0.05
+
+
+def test_a_lower_rate_computes_fewer_pixels(variables, encoded, monkeypatch):
+    shaded, shade_points = [], image.shade_points
+
+    def counted(*arguments):
+        shaded.append(len(arguments[4]))
+        return shade_points(*arguments)
+
+    monkeypatch.setattr(image, "shade_points", counted)
+    position, normal, mask = ground_picture()
+    arguments = (tiny.NETWORK, tiny.LIMITS, variables, encoded, position, normal, mask)
+    full, _ = image.shade_image(*arguments)
+    half, _ = image.shade_image(*arguments, resolution_scale=0.5)
+    assert shaded[0] == mask.sum()
+    assert shaded[1] == pytest.approx(mask.sum() / 4, rel=0.1)
+    assert shaded[2] < 0.1 * mask.sum()
+    np.testing.assert_array_equal(half[~mask], full[~mask])
+    spread = np.ptp(full[mask])
+    assert np.sqrt(np.mean((half - full)[mask] ** 2)) < 0.1 * spread
+    rows, columns = (image.sample_pixels(n, 0.5) for n in mask.shape)
+    sampled = np.ix_(rows, columns)
+    np.testing.assert_allclose(half[sampled], full[sampled], atol=1e-5)
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, 1.5, np.nan])
+def test_unusable_resolution_scale_is_refused(variables, encoded, scale):
+    arguments = (tiny.NETWORK, tiny.LIMITS, variables, encoded)
+    with pytest.raises(InputError, match=r"^resolution scale [^\n]*\Z"):
+        image.shade_image(*arguments, *ground_picture(), resolution_scale=scale)

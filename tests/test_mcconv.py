@@ -15,7 +15,8 @@ from hypothesis.extra import numpy as hnp
 from strategies import ALL_PAIRS, POINTS, QUERIES, SEEDS, UNIT, lattice, pad
 
 from ginn_jax import mcconv as mc
-from ginn_jax.voxels import EdgeLimit, build_grid, radius_edges
+from ginn_jax.packets import EdgeLimit, radius_edges
+from ginn_jax.voxels import build_grid
 
 CHANNELS, OUTPUTS, HIDDEN, BANDWIDTH = 3, 2, 5, 0.3
 PAIRS = POINTS * POINTS * QUERIES
@@ -29,7 +30,7 @@ def field_of(senders, receivers, radius, variant, pairs=PAIRS):
     """The receptive field, and how many pairs its densities looked at."""
     density, oriented = variant
     grid = build_grid(senders.position, senders.mask, radius)
-    limit = EdgeLimit(POINTS * QUERIES, POINTS * QUERIES)
+    limit = ALL_PAIRS
     edges = radius_edges(grid, receivers.position, receivers.mask, radius, limit)
     inputs = mc.kernel_inputs(senders, receivers, edges, radius, oriented)
     positions = senders.position, receivers.position
@@ -40,7 +41,8 @@ def field_of(senders, receivers, radius, variant, pairs=PAIRS):
         area = mc.point_area(senders.position, senders.mask, own, radius)
         count = receivers.mask.shape[0]
         weight, demand = mc.surface_weight(area, edges, count, radius), 0
-    return mc.Field(edges.sender, edges.receiver, inputs, weight), demand
+    count = edges.demand.edges
+    return mc.Field(edges.sender, edges.receiver, inputs, weight, count), demand
 
 
 @partial(jax.jit, static_argnames="mixes")
@@ -116,7 +118,7 @@ def value(case, variant, mixes=False, group=CHANNELS):
     field, demand = field_of(case.senders, case.receivers, radius, variant)
     assert demand <= PAIRS
     values = CHANNELS * (OUTPUTS if mixes else 1)
-    kernel = make_kernel(case.seed, field.inputs.shape[1], values, group)
+    kernel = make_kernel(case.seed, field.inputs.shape[0], values, group)
     return np.asarray(apply(kernel, case.features, field, mixes))
 
 
@@ -260,7 +262,7 @@ def problem(case, variant, mixes):
     """Kernel and features, their field, a direction to differentiate in."""
     field, _ = field_of(case.senders, case.receivers, np.float32(case.radius), variant)
     count = CHANNELS * (OUTPUTS if mixes else 1)
-    kernel = make_kernel(case.seed, field.inputs.shape[1], count, 2)
+    kernel = make_kernel(case.seed, field.inputs.shape[0], count, 2)
     width = OUTPUTS if mixes else CHANNELS
     cotangent = np.random.default_rng(6).normal(size=(QUERIES, width))
     return (kernel, case.features), field, cotangent
@@ -339,7 +341,7 @@ def test_padding_contributes_nothing_to_values_and_gradients(
         padded = np.asarray(field.receiver) == QUERIES
         assert padded.any()
         assert not np.asarray(field.weight)[padded].any()
-        assert not np.asarray(field.inputs)[padded].any()
+        assert not np.asarray(field.inputs)[:, padded].any()
         slopes = gradient(parameters, field, cotangent.astype(np.float32), mixes)
         assert not np.asarray(slopes[1])[~mask].any()
         results.append((apply(*parameters, field, mixes), slopes))
@@ -365,7 +367,7 @@ def test_rotation_turns_offsets_and_keeps_products(case, seed):
             senders, receivers, np.float32(case.radius), ("surface", True)
         )
         order = np.lexsort((field.sender, field.receiver))
-        inputs.append(np.asarray(field.inputs)[order])
+        inputs.append(np.asarray(field.inputs).T[order])
     before, after = inputs
     np.testing.assert_allclose(after[:, :3], before[:, :3] @ turn.T, atol=1e-5)
     np.testing.assert_allclose(after[:, 3:], before[:, 3:], atol=1e-5)
@@ -388,7 +390,7 @@ def test_density_tells_how_many_pairs_it_needs(dense_case):
 def area_of(position, radius):
     mask = jnp.ones(position.shape[0], bool)
     grid = build_grid(position, mask, radius)
-    limit = EdgeLimit(1 << 18, 1 << 17)
+    limit = EdgeLimit(1 << 14, 1 << 18, 1 << 12, 1 << 17)
     edges = radius_edges(grid, position, mask, radius, limit)
     return mc.point_area(position, mask, edges, radius), edges.demand
 
@@ -422,3 +424,51 @@ def test_new_kernels_are_scaled_to_their_inputs(outputs, group, blocks):
     assert (
         abs(np.corrcoef(kernel.w2[0].ravel(), kernel.w1[0, :100].ravel())[0, 1]) < 0.1
     )
+
+
+def test_tiles_change_nothing(monkeypatch):
+    """Several tiles, the last one overlapping the one before, and padding after it."""
+    rng = np.random.default_rng(2)
+    edges, count, rows = 100, 83, 9
+    field = mc.Field(
+        rng.integers(0, rows, edges).astype(np.int32),
+        np.where(np.arange(edges) < count, rng.integers(0, rows, edges), rows).astype(
+            np.int32
+        ),
+        rng.normal(size=(3, edges)).astype(np.float32),
+        rng.random(edges).astype(np.float32),
+        np.int32(count),
+    )
+    field = jax.tree.map(jnp.asarray, field)
+    kernel = make_kernel(0, 3, CHANNELS, CHANNELS)
+    features = rng.normal(size=(rows, CHANNELS)).astype(np.float32)
+
+    def results():
+        def total(kernel, features, inputs, weight):
+            varied = field._replace(inputs=inputs, weight=weight)
+            return jnp.sum(jnp.sin(mc.mc_conv(kernel, features, varied, rows)))
+
+        arguments = kernel, features, field.inputs, field.weight
+        return jax.jit(jax.value_and_grad(total, argnums=(0, 1, 2, 3)))(*arguments)
+
+    whole = results()
+    monkeypatch.setattr(mc, "TILE", 32)
+    parts = results()
+    jax.tree.map(
+        partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5), parts, whole
+    )
+    assert not np.asarray(parts[1][3])[count:].any()
+
+
+def test_gathered_columns_have_the_gradient_of_a_gather():
+    rng = np.random.default_rng(3)
+    table = jnp.asarray(rng.normal(size=(2, 6)), jnp.float32)
+    index = jnp.asarray(rng.integers(0, 6, 10), jnp.int32)
+
+    def total(table):
+        taken = mc.take_columns(table, index, jnp.int32(7))
+        return jnp.sum(jnp.where(np.arange(10) < 7, taken**2, 0.0))
+
+    slope, values = np.zeros((2, 6)), np.asarray(table)
+    np.add.at(slope.T, index[:7], 2 * values.T[index[:7]])
+    np.testing.assert_allclose(jax.grad(total)(table), slope, rtol=1e-6)

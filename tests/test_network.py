@@ -79,8 +79,8 @@ def unfilled(network, attributes, query_attributes):
     zeros = jnp.zeros((rows, 3))
     level = Oriented(zeros, zeros, jnp.ones(rows, bool))
     index = jnp.zeros(edges, jnp.int32)
-    inputs = jnp.zeros((edges, 7 if network.oriented else 3))
-    field = Field(index, index, inputs, jnp.zeros(edges))
+    inputs = jnp.zeros((7 if network.oriented else 3, edges))
+    field = Field(index, index, inputs, jnp.zeros(edges), jnp.int32(edges))
     fields = {c.name: field for c in network.encoder}
     geometry = Geometry((level,) * 4, index, fields, None, None)
 

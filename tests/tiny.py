@@ -29,7 +29,8 @@ CONFIG = train.Training(
 def _capacity(name):
     if name.endswith(".points"):
         return {"level_0.points": 1152, "level_1.points": 256}[name]
-    return 28672 if name.endswith(".candidates") else 10240
+    sizes = {"columns": 10240, "candidates": 65536, "words": 2048, "edges": 10240}
+    return sizes[name.rsplit(".", 1)[1]]
 
 
 # What `measure_limits` finds for `CONFIG`, rounded up.
@@ -84,7 +85,7 @@ def fresh_state(config=CONFIG, limits=LIMITS):
 @cache
 def _initial_state(config, limits):
     with cheap_compiling():
-        return jax.tree.map(np.array, train.init_state(config, limits))
+        return jax.tree.map(np.array, train.init_state(config))
 
 
 @contextmanager

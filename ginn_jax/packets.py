@@ -1,0 +1,248 @@
+"""Radius search by packets of queries: jit-compatible, fixed capacity, nothing dropped.
+
+Packets of 32 consecutive queries share one list of candidates, the points within the
+radius of the packet's bounding box. What is left for the single query is a dense test
+against 32 candidates at a time, whose outcome is one word of bits; edges are listed by
+counting and selecting bits. So the cost is that of the edges, not of the candidates.
+Queries may come in any order: a packet that is spread out costs time, never an edge.
+`voxels.morton_order`, or the tiles of an image, keep packets small.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+from ginn_jax.voxels import (
+    VoxelGrid,
+    cell_of,
+    expand_ranges,
+    narrow_runs,
+    prefix_sum,
+    saturating_sum,
+)
+
+PACKET = 32
+WORD = 32
+PairFilter = Callable[[Int[Array, "..."], Int[Array, "..."]], Bool[Array, "..."]]
+
+
+@dataclass(frozen=True)
+class EdgeLimit:
+    """Capacities of one search.
+
+    columns     grid columns under the packets
+    candidates  points that packets reach
+    words       lists of 32 candidates
+    edges       pairs closer than the radius
+    """
+
+    columns: int
+    candidates: int
+    words: int
+    edges: int
+
+
+class Demand(NamedTuple):
+    """What a search needed; a lower bound where an earlier stage overflowed."""
+
+    columns: Int[Array, ""]
+    candidates: Int[Array, ""]
+    words: Int[Array, ""]
+    edges: Int[Array, ""]
+
+
+class Edges(NamedTuple):
+    """Pairs closer than the radius, `receiver` ascending; padding has receiver M."""
+
+    sender: Int[Array, "E"]
+    receiver: Int[Array, "E"]
+    demand: Demand
+
+
+class Columns(NamedTuple):
+    """The block of grid columns under every packet, and the box it may reach into."""
+
+    low: Float[Array, "P 3"]
+    high: Float[Array, "P 3"]
+    first: Int[Array, "P 2"]
+    shape: Int[Array, "P 2"]
+
+
+class Candidates(NamedTuple):
+    """Rows of the grid that each packet reaches: `row[start : start + count]`."""
+
+    row: Int[Array, "C"]
+    start: Int[Array, "P"]
+    count: Int[Array, "P"]
+
+
+class Words(NamedTuple):
+    """Bit b of `word[l, q]`: `query[l, q]` is closer to the list's candidate b.
+
+    One list is 32 candidates of one packet. `order` are the rows of the flat words by
+    query, and under a query by list; padding comes last.
+    """
+
+    word: UInt32[Array, "L 32"]
+    query: Int[Array, "L 32"]
+    first: Int[Array, "L"]
+    order: Int[Array, "W"]
+
+
+def radius_edges(
+    grid: VoxelGrid,
+    query: Float[Array, "M 3"],
+    mask: Bool[Array, "M"],
+    radius: Float[Array, ""],
+    limit: EdgeLimit,
+    pair_filter: PairFilter | None = None,
+) -> Edges:
+    """Every (point, query) pair closer than `radius`, sorted by query.
+
+    `pair_filter(sender, receiver)` may drop pairs; it sees broadcast index arrays.
+    Where `demand` exceeds `limit`, edges are missing.
+    """
+    count = query.shape[0]
+    padding = -count % PACKET
+    query = jnp.pad(query, ((0, padding), (0, 0)))
+    mask = jnp.pad(mask, (0, padding))
+    under, columns = packet_columns(grid, query, mask, radius)
+    near, candidates = packet_candidates(grid, under, limit.columns, limit.candidates)
+    words = packet_words(grid, query, mask, radius, near, limit.words, pair_filter)
+    (row, receiver, real), edges = list_bits(words, near, limit.edges)
+    sender = jnp.where(real, grid.index[row], 0)
+    receiver = jnp.where(real, receiver, count)
+    demand = Demand(columns, candidates, count_words(near), edges)
+    return Edges(sender, receiver, demand)
+
+
+def packet_columns(
+    grid: VoxelGrid,
+    query: Float[Array, "M 3"],
+    mask: Bool[Array, "M"],
+    radius: Float[Array, ""],
+) -> tuple[Columns, Int[Array, ""]]:
+    """The columns that each packet has to look into, and how many in all."""
+    far = jnp.float32(jnp.finfo(jnp.float32).max)
+    reach = 1.00001 * radius
+    lanes = (-1, PACKET, 3)
+    low = jnp.min(jnp.where(mask[:, None], query, far).reshape(lanes), axis=1)
+    high = jnp.max(jnp.where(mask[:, None], query, -far).reshape(lanes), axis=1)
+    empty = low[:, :1] > high[:, :1]
+    low = jnp.where(empty, 0.0, low) - reach
+    high = jnp.where(empty, 0.0, high) + reach
+    first = jnp.stack(
+        [jnp.maximum(cell_of(grid, low[:, a], a), 0) for a in (0, 1)], axis=1
+    )
+    last = [
+        jnp.minimum(cell_of(grid, high[:, a], a), grid.shape[a] - 1) for a in (0, 1)
+    ]
+    shape = jnp.maximum(jnp.stack(last, axis=1) - first + 1, 0)
+    shape = jnp.where(empty, 0, shape)
+    total = saturating_sum(shape[:, 0] * shape[:, 1])
+    return Columns(low, high, first, shape), total
+
+
+def packet_candidates(
+    grid: VoxelGrid,
+    under: Columns,
+    columns: int,
+    candidates: int,
+) -> tuple[Candidates, Int[Array, ""]]:
+    """Points in the columns and layers that each packet reaches; how many in all."""
+    area = under.shape[:, 0] * under.shape[:, 1]
+    slots, _ = expand_ranges(jnp.zeros_like(area), area, columns)
+    packet = slots.owner
+    deep = jnp.maximum(under.shape[packet, 1], 1)
+    x, y = under.first[packet].T + jnp.stack([slots.row // deep, slots.row % deep])
+    column = jnp.where(slots.valid, x * grid.shape[1] + y, 0)
+    first = grid.column_start[column]
+    last = jnp.where(slots.valid, grid.column_start[column + 1], first)
+    floor, top = (cell_of(grid, e[packet, 2], 2) for e in (under.low, under.high))
+    start, stop = narrow_runs(grid.layer, first, last, floor, top + 1)
+    count = jnp.zeros(area.size, jnp.int32)
+    count = count.at[packet].add(stop - start, indices_are_sorted=True)
+    found, total = expand_ranges(start, stop - start, candidates)
+    return Candidates(found.row, prefix_sum(count) - count, count), total
+
+
+def count_words(near: Candidates) -> Int[Array, ""]:
+    """How many lists of 32 candidates there are."""
+    return jnp.sum(-(-near.count // WORD))
+
+
+def packet_words(
+    grid: VoxelGrid,
+    query: Float[Array, "M 3"],
+    mask: Bool[Array, "M"],
+    radius: Float[Array, ""],
+    near: Candidates,
+    capacity: int,
+    pair_filter: PairFilter | None = None,
+    number: Int[Array, "M"] | None = None,
+) -> Words:
+    """The outcome of testing every query against the candidates of its packet.
+
+    `number` are the queries' own numbers, a permutation, if they are not in order.
+    """
+    lists = -(-near.count // WORD)
+    chunk, _ = expand_ranges(jnp.zeros_like(lists), lists, capacity)
+    packet = chunk.owner
+    first = near.start[packet] + WORD * chunk.row
+    left = jnp.where(chunk.valid, near.count[packet] - WORD * chunk.row, 0)
+    bit = jnp.arange(WORD, dtype=jnp.int32)
+    row = near.row[jnp.minimum(first[:, None] + bit, near.row.size - 1)]
+    point = jnp.where((bit < left[:, None])[..., None], grid.position[row], jnp.nan)
+    lane = jnp.where(mask[:, None], query, jnp.nan).reshape(-1, PACKET, 3)[packet]
+    offset = [lane[:, :, None, axis] - point[:, None, :, axis] for axis in range(3)]
+    hit = offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2 < radius**2
+    if pair_filter is not None:
+        own = packet[:, None] * PACKET + jnp.arange(PACKET, dtype=jnp.int32)
+        hit &= pair_filter(grid.index[row][:, None, :], own[:, :, None])
+    # A sum, so that XLA does not compute a word anew for each edge that looks at it.
+    flags = jnp.uint32(1) << bit.astype(jnp.uint32)
+    word = jnp.sum(jnp.where(hit, flags, jnp.uint32(0)), axis=-1)
+    # The words of a query side by side, so that its edges will be.
+    query_lists = jnp.repeat(lists, PACKET)
+    if number is None:
+        number = jnp.arange(query_lists.size, dtype=jnp.int32)
+        begin = (prefix_sum(lists) - lists).repeat(PACKET) * PACKET
+        begin += lists.repeat(PACKET) * (number % PACKET)
+    else:
+        begin = jnp.zeros_like(query_lists).at[number].set(query_lists)
+        begin = (prefix_sum(begin) - begin)[number]
+    place = begin.reshape(-1, PACKET)[packet] + chunk.row[:, None]
+    place = jnp.where(chunk.valid[:, None], place, word.size).reshape(-1)
+    order = jnp.full(word.size, word.size - 1, jnp.int32)
+    order = order.at[place].set(jnp.arange(word.size, dtype=jnp.int32), mode="drop")
+    return Words(word, number.reshape(-1, PACKET)[packet], first, order)
+
+
+def list_bits(
+    words: Words, near: Candidates, capacity: int
+) -> tuple[tuple[Int[Array, "E"], Int[Array, "E"], Bool[Array, "E"]], Int[Array, ""]]:
+    """Row, query and validity of every set bit, and how many there are."""
+    flat = words.word.reshape(-1)
+    hits = jax.lax.population_count(flat[words.order]).astype(jnp.int32)
+    slots, total = expand_ranges(jnp.zeros_like(hits), hits, capacity)
+    place = words.order[slots.owner]
+    bit = select_bit(flat[place], slots.row)
+    row = jnp.where(slots.valid, words.first[place // PACKET] + bit, 0)
+    return (near.row[row], words.query.reshape(-1)[place], slots.valid), total
+
+
+def select_bit(word: UInt32[Array, "*E"], rank: Int[Array, "*E"]) -> Int[Array, "*E"]:
+    """Place of the set bit that has `rank` set bits below it, by halving."""
+    place = jnp.zeros_like(rank)
+    for width in (16, 8, 4, 2, 1):
+        below = word & jnp.uint32((1 << width) - 1)
+        ones = jax.lax.population_count(below).astype(jnp.int32)
+        upper = rank >= ones
+        rank = jnp.where(upper, rank - ones, rank)
+        word = jnp.where(upper, word >> width, word)
+        place += jnp.where(upper, width, 0)
+    return place

@@ -1,0 +1,102 @@
+"""What packets of queries promise beyond a search's results (`test_neighbors`)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from oracles import neighbors
+
+from ginn_jax import packets as pk
+from ginn_jax import voxels as vx
+
+pick = jax.jit(pk.select_bit)
+search = jax.jit(pk.radius_edges, static_argnames="limit")
+make_grid = jax.jit(vx.build_grid)
+order_of = jax.jit(vx.morton_order)
+ROOM = pk.EdgeLimit(4096, 1 << 15, 1024, 1 << 15)
+
+
+@given(st.lists(st.integers(1, 2**32 - 1), min_size=6, max_size=6))
+def test_bits_are_selected_by_rank(words):
+    places = [[b for b in range(32) if word >> b & 1] for word in words]
+    cases = [
+        (w, r, b)
+        for w, bits in zip(words, places, strict=True)
+        for r, b in enumerate(bits)
+    ]
+    cases += [(1, 0, 0)] * (192 - len(cases))
+    word, rank, bit = np.array(cases).T
+    found = pick(word.astype(np.uint32), rank.astype(np.int32))
+    np.testing.assert_array_equal(found, bit)
+
+
+@pytest.fixture(scope="module")
+def crowd():
+    """More candidates to a packet than a word holds, queries in no order."""
+    rng = np.random.default_rng(5)
+    return rng.random((400, 3)).astype(np.float32), rng.random((150, 3)).astype(
+        np.float32
+    )
+
+
+def pairs(points, queries, radius, limit=ROOM):
+    grid = make_grid(points, np.ones(len(points), bool), np.float32(radius))
+    mask = np.ones(len(queries), bool)
+    edges = search(grid, queries, mask, np.float32(radius), limit)
+    edges = jax.tree.map(np.asarray, edges)
+    real = edges.receiver < len(queries)
+    assert (np.diff(edges.receiver) >= 0).all()
+    listed = list(
+        zip(edges.receiver[real].tolist(), edges.sender[real].tolist(), strict=True)
+    )
+    assert len(set(listed)) == len(listed)
+    return set(listed), edges.demand
+
+
+def test_lists_of_several_words_and_a_last_packet_that_is_not_full(crowd):
+    points, queries = crowd
+    assert len(queries) % pk.PACKET
+    found, demand = pairs(points, queries, 0.3)
+    assert found == set(neighbors(points.astype(float), queries.astype(float), 0.3))
+    assert demand.words > 2 * -(-len(queries) // pk.PACKET)
+
+
+def test_exact_limits_suffice_and_one_less_is_told(crowd):
+    points, queries = crowd
+    full, demand = pairs(points, queries, 0.3)
+    exact = pk.EdgeLimit(*(int(need) for need in demand))
+    assert pairs(points, queries, 0.3, exact) == (full, demand)
+    for name in demand._fields:
+        short = pk.EdgeLimit(
+            **{n: int(v) - (n == name) for n, v in demand._asdict().items()}
+        )
+        found, told = pairs(points, queries, 0.3, short)
+        assert found <= full
+        assert getattr(told, name) == getattr(demand, name)
+
+
+@given(hnp.arrays(np.float32, (40, 3), elements=st.floats(-5, 5, width=32)))
+def test_morton_order_is_a_permutation_with_padding_last(position):
+    mask = np.arange(40) % 5 != 0
+    order = np.asarray(order_of(position, mask))
+    assert sorted(order.tolist()) == list(range(40))
+    assert mask[order][: mask.sum()].all()
+
+
+def test_morton_order_brings_neighbours_together():
+    position = np.random.default_rng(0).random((4096, 3)).astype(np.float32)
+    order = np.asarray(order_of(position, np.ones(4096, bool)))
+    boxes = np.ptp(position[order].reshape(-1, 32, 3), axis=1).max(axis=1)
+    assert np.median(boxes) < 0.4
+    assert np.median(np.ptp(position.reshape(-1, 32, 3), axis=1).max(axis=1)) > 0.8
+
+
+@given(hnp.arrays(np.uint32, 50, elements=st.integers(0, 7)))
+def test_orders_are_stable(keys):
+    expected = np.argsort(keys, kind="stable")
+    for bits in (3, 31):
+        found = jax.jit(vx.stable_order, static_argnums=1)(jnp.asarray(keys), bits)
+        np.testing.assert_array_equal(found, expected)
