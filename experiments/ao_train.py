@@ -69,6 +69,8 @@ class Options:
     """Adam's learning rate at its highest."""
     resolution: int = 512
     """Side of the evaluation images in pixels."""
+    resolution_scale: float = 0.5
+    """Shade the evaluation images at this share of their resolution too; 1: do not."""
     seed: int = 0
     """Seed of everything."""
     resume: bool = False
@@ -159,6 +161,10 @@ def check(options: Options) -> None:
     least = {"shapes": 0, "test_shapes": 1, "rays": 2, "points": 1000, "steps": 1}
     least |= {"batch": 1, "resolution": 32, "seed": 0}
     require(options, least)
+    if not 0 < options.resolution_scale <= 1:
+        raise InputError(
+            f"--resolution-scale is {options.resolution_scale}: give it in (0, 1]"
+        )
     for name in ("radius", "learning_rate"):
         value = getattr(options, name)
         if not (np.isfinite(value) and value > 0):
@@ -291,6 +297,11 @@ def image_evaluation(
             rows.append(row | {"name": source.name})
             if radius == own:
                 pictures.append((source.name, view.reference, image))
+            if radius == own and options.resolution_scale < 1:
+                row, _, held = evaluate.network_row(
+                    variant, held, model, cloud, view, options.resolution_scale
+                )
+                rows.append(row | {"name": source.name})
     for i, view in enumerate(views):
         for rays in RAY_COUNTS:
             row = evaluate.ray_row(view, options.radius, rays, seed=1000 + i)
@@ -302,7 +313,7 @@ def image_evaluation(
     }
     report.draw_views(options.out / "views.png", pictures)
     report.draw_error_against_time(options.out / "error_against_time.png", groups)
-    mine = next(r for r in means if r.get("disk_radius") == own)
+    mine = next(r for r in means if r["method"] == f"network, disk {own:g}")
     return {
         "mse_2d": mine["mse_2d"],
         "dssim_2d": mine["dssim_2d"],

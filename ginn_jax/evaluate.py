@@ -152,9 +152,17 @@ def timed(work: Callable[[], Any], repeats: int = 3) -> tuple[Any, float, float]
 
 
 def network_row(
-    network: Network, limits: Limits, model: Model, cloud: ShadedPoints, view: View
+    network: Network,
+    limits: Limits,
+    model: Model,
+    cloud: ShadedPoints,
+    view: View,
+    scale: float = 1.0,
 ) -> tuple[Row, Float[np.ndarray, "H W"], Limits]:
-    """Errors and times of the network on one object, its image, the limits it took."""
+    """Errors and times of the network on one object, its image, the limits it took.
+
+    `scale` is the resolution scale of `shade_image`.
+    """
     radius = network.levels[0]
     arguments = (cloud.position, cloud.normal)
     _, limits = encode_cloud(
@@ -166,12 +174,16 @@ def network_row(
         )
     )
     pixels = (view.gbuffer.position, view.gbuffer.normal, view.gbuffer.mask)
-    _, limits = shade_image(network, limits, model.variables, encoded, *pixels)
-    (image, limits), _, flat = timed(
-        lambda: shade_image(network, limits, model.variables, encoded, *pixels)
-    )
+
+    def shade() -> tuple[Float[np.ndarray, "H W"], Limits]:
+        arrays = model.variables, encoded, *pixels
+        return shade_image(network, limits, *arrays, resolution_scale=scale)
+
+    _, limits = shade()
+    (image, limits), _, flat = timed(shade)
+    lower = f", scale {scale:g}" if scale < 1 else ""
     row = {
-        "method": f"network, disk {radius:g}",
+        "method": f"network, disk {radius:g}{lower}",
         "disk_radius": radius,
         "points": int(np.sum(encoded.points.mask)),
         "seconds_3d": deep,

@@ -35,7 +35,7 @@ from ginn_jax.train import (
 )
 
 PROBES = 300
-PROBE_SLACK = 1.1
+PROBE_SLACK = 1.25
 RAISE_SLACK = 1.25
 
 

@@ -23,6 +23,7 @@ NETWORKS = {
 }
 SHALLOW = compact_network(4, (0.25,), query_radius=0.25, density="kde")
 GENEROUS = {"points": 512, "edges": 1 << 14, "candidates": 1 << 15, "pairs": 1 << 16}
+GENEROUS |= {"columns": 1 << 12, "words": 1 << 10}
 
 
 def sphere(count, seed):
@@ -217,7 +218,8 @@ def shallow():
         ("level_0.candidates",),
         ("level_0.edges",),
         ("level_0.points",),
-        ("conv_0.candidates", "query.candidates"),
+        ("conv_0.columns", "query.columns"),
+        ("level_0.words",),
         ("conv_0.edges", "query.edges"),
         ("conv_0.pairs", "query.pairs"),
     ],

@@ -202,7 +202,8 @@ def queries(isolated=0):
 
 
 def limits_of(network, factor=1):
-    sizes = {"candidates": 49152, "edges": 12288, "pairs": 196608, "points": ROWS}
+    sizes = {"columns": 8192, "candidates": 49152, "words": 2048}
+    sizes |= {"edges": 12288, "pairs": 196608, "points": ROWS}
     limits = uniform_limits(network, 0)
     names = limit_names(network)
     return type(limits)(tuple((n, int(factor * sizes[n.split(".")[1]])) for n in names))

@@ -97,7 +97,7 @@ def test_overflow_leaves_the_state_alone(trained):
     assert not report.fits
     assert tiny.identical(after, state)
     short = exceeded(tiny.LIMITS, report.demands)
-    assert short["level_0.candidates"] > tiny.LIMITS.of("level_0.candidates")
+    assert short["level_0.edges"] > tiny.LIMITS.of("level_0.edges")
     # What follows is as though nothing had happened.
     again, _ = run(after, 1)
     unbroken, _ = run(train.place(tiny.CONFIG, state), 1)
