@@ -25,9 +25,9 @@ from ginn_jax.architecture import Network, compact_network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
 from ginn_jax.geometry import Limits, uniform_limits
-from ginn_jax.mcconv import Oriented
 from ginn_jax.mesh import find_meshes
 from ginn_jax.network import Variables
+from ginn_jax.receptive_field import Oriented
 from ginn_jax.reference import GBuffer, Scene
 from ginn_jax.train import Training, init_state
 

@@ -24,9 +24,10 @@ from benchmarks.neighbors import surface, uniform
 from benchmarks.timing import describe, load, measure
 from ginn_jax import report
 from ginn_jax.commandline import require, start
-from ginn_jax.mcconv import Field, Kernel, init_kernel, mc_conv
+from ginn_jax.mcconv import Kernel, init_kernel, mc_conv
 from ginn_jax.neighbors import find_neighbors
 from ginn_jax.process import available_cores
+from ginn_jax.receptive_field import Field
 
 INPUTS = 7
 TOLERANCE = 1e-4

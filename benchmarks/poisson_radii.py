@@ -43,11 +43,11 @@ from ginn_jax.image import (
     shade_points,
     with_disk_radius,
 )
-from ginn_jax.mcconv import Oriented
 from ginn_jax.mesh import Samples, find_meshes
 from ginn_jax.metrics import mse
 from ginn_jax.neighbors import bucket, pad_rows
 from ginn_jax.network import Variables
+from ginn_jax.receptive_field import Oriented
 from ginn_jax.reference import build_scene
 from ginn_jax.train import Training, init_state
 

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ginn_jax.architecture import Network
-from ginn_jax.mcconv import Kernel, Oriented
+from ginn_jax.mcconv import Kernel
 from ginn_jax.network import SLOPE, Variables
+from ginn_jax.receptive_field import Oriented
 from ginn_jax.voxels import VoxelGrid, cell_of, compact, expand_ranges, narrow_runs
 
 

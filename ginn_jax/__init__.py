@@ -14,9 +14,11 @@ Modules, in the order the data flows; each imports only what stands before it:
     camera            pinhole cameras
     libllvm, reference    ground truth by ray tracing (the only use of a renderer)
     voxels            fixed-capacity voxel hash under jit
+    packets           radius search by packets of queries under jit
     neighbors         radius search on the host: exact, sizes itself
     hierarchy         Poisson disk sampling
-    mcconv            receptive fields and Monte Carlo convolution
+    receptive_field   what an edge shows a kernel, what its sender weighs
+    mcconv            Monte Carlo convolution, tile by tile
     dataset           shaded points: one type for a cloud and for a G-buffer
     scenes            from objects to clouds with ground truth, in worker processes
     architecture      the network as a table of layers; presets
@@ -25,6 +27,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     train             one jitted step: geometry, gradient, update
     checkpoint        saving, resuming, loading weights
     fit               the training loop of a run
+    upsample          shading at a lower rate, guided by the G-buffer
     image             from a cloud and a G-buffer to an image
     metrics           errors, noise floors, equal ray counts
     evaluate          errors at points, in images, against run time

@@ -41,7 +41,7 @@ class Network:
     hidden      width of the kernel perceptrons
     group       kernel values per perceptron: the paper's blocks; 0 for one shared block
     oriented    whether kernels see normals beside offsets
-    density     how senders are weighted, see `mcconv`
+    density     how senders are weighted, see `receptive_field`
     norm        "batch" with running moments, "layer" over channels, or "none"
     """
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from ginn_jax.errors import InputError
-from ginn_jax.mcconv import Oriented
+from ginn_jax.receptive_field import Oriented
 
 # Clouds of a batch stand this far apart: more than any radius and both extents.
 SPACING = 4.0

@@ -15,7 +15,8 @@ from jaxtyping import Array, Bool, Int, Key
 
 from ginn_jax.architecture import Conv, Network
 from ginn_jax.hierarchy import Level, LevelLimit, build_level
-from ginn_jax.mcconv import (
+from ginn_jax.packets import Demand, EdgeLimit, Edges, radius_edges
+from ginn_jax.receptive_field import (
     Field,
     Oriented,
     kde_weight,
@@ -23,7 +24,6 @@ from ginn_jax.mcconv import (
     point_area,
     surface_weight,
 )
-from ginn_jax.packets import Demand, EdgeLimit, Edges, radius_edges
 from ginn_jax.voxels import VoxelGrid, build_grid
 
 Demands = dict[str, Int[Any, ""]]

@@ -24,10 +24,10 @@ from ginn_jax.geometry import (
     limits_for,
     raise_limits,
 )
-from ginn_jax.mcconv import Oriented
 from ginn_jax.neighbors import bucket, pad_rows
 from ginn_jax.network import Encoder, Shader, Variables
 from ginn_jax.process import ALONE
+from ginn_jax.receptive_field import Oriented
 from ginn_jax.upsample import Surface, sample_pixels, upsample
 from ginn_jax.voxels import VoxelGrid, morton_order
 

@@ -27,9 +27,9 @@ from ginn_jax.geometry import (
     fits,
     uniform_limits,
 )
-from ginn_jax.mcconv import Field, Oriented
 from ginn_jax.network import Encoder, Shader, Variables
 from ginn_jax.process import ALONE
+from ginn_jax.receptive_field import Field, Oriented
 from ginn_jax.voxels import compact, morton_order
 
 

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from ginn_jax import geometry as ge
 from ginn_jax.architecture import PRESETS, Network, compact_network, released_table
-from ginn_jax.mcconv import Oriented
 from ginn_jax.packets import Demand, Edges
+from ginn_jax.receptive_field import Oriented
 
 RADIUS = 0.5
 LEVELS = (0.1, 0.25)

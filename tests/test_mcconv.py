@@ -15,6 +15,7 @@ from hypothesis.extra import numpy as hnp
 from strategies import ALL_PAIRS, POINTS, QUERIES, SEEDS, UNIT, lattice, pad
 
 from ginn_jax import mcconv as mc
+from ginn_jax import receptive_field as rf
 from ginn_jax.packets import EdgeLimit, radius_edges
 from ginn_jax.voxels import build_grid
 
@@ -32,17 +33,17 @@ def field_of(senders, receivers, radius, variant, pairs=PAIRS):
     grid = build_grid(senders.position, senders.mask, radius)
     limit = ALL_PAIRS
     edges = radius_edges(grid, receivers.position, receivers.mask, radius, limit)
-    inputs = mc.kernel_inputs(senders, receivers, edges, radius, oriented)
+    inputs = rf.kernel_inputs(senders, receivers, edges, radius, oriented)
     positions = senders.position, receivers.position
     if density == "kde":
-        weight, demand = mc.kde_weight(*positions, edges, radius, BANDWIDTH, pairs)
+        weight, demand = rf.kde_weight(*positions, edges, radius, BANDWIDTH, pairs)
     else:
         own = radius_edges(grid, senders.position, senders.mask, radius, ALL_PAIRS)
-        area = mc.point_area(senders.position, senders.mask, own, radius)
+        area = rf.point_area(senders.position, senders.mask, own, radius)
         count = receivers.mask.shape[0]
-        weight, demand = mc.surface_weight(area, edges, count, radius), 0
+        weight, demand = rf.surface_weight(area, edges, count, radius), 0
     count = edges.demand.edges
-    return mc.Field(edges.sender, edges.receiver, inputs, weight, count), demand
+    return rf.Field(edges.sender, edges.receiver, inputs, weight, count), demand
 
 
 @partial(jax.jit, static_argnames="mixes")
@@ -69,9 +70,9 @@ def make_kernel(seed, inputs, values, group):
 class Case(NamedTuple):
     """Senders with features, receivers, a radius and the seed of a kernel."""
 
-    senders: mc.Oriented
+    senders: rf.Oriented
     features: np.ndarray
-    receivers: mc.Oriented
+    receivers: rf.Oriented
     radius: float
     seed: int
 
@@ -85,7 +86,7 @@ class Case(NamedTuple):
 def with_normals(cloud, rng):
     normal = rng.normal(size=cloud.position.shape)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    return mc.Oriented(cloud.position, normal.astype(np.float32), cloud.mask)
+    return rf.Oriented(cloud.position, normal.astype(np.float32), cloud.mask)
 
 
 def clear_of_radius(points, queries, radius):
@@ -139,7 +140,7 @@ def map_points(case, change):
 
 def take(case, rows):
     """The case with these rows as its senders."""
-    senders = mc.Oriented(*(a[rows] for a in case.senders))
+    senders = rf.Oriented(*(a[rows] for a in case.senders))
     return case._replace(senders=senders, features=case.features[rows])
 
 
@@ -180,7 +181,7 @@ def test_more_padding_changes_nothing(variant, case):
         np.pad(a, [(0, POINTS)] + [(0, 0)] * (a.ndim - 1))
         for a in (*case.senders, case.features)
     ]
-    padded = case._replace(senders=mc.Oriented(*wider[:3]), features=wider[3])
+    padded = case._replace(senders=rf.Oriented(*wider[:3]), features=wider[3])
     assert_close(value(padded, variant), value(case, variant))
 
 
@@ -335,7 +336,7 @@ def test_padding_contributes_nothing_to_values_and_gradients(
             for a in (*dense_case.senders[:2], dense_case.features)
         )
         case = dense_case._replace(
-            senders=mc.Oriented(position, normal, mask), features=features
+            senders=rf.Oriented(position, normal, mask), features=features
         )
         parameters, field, cotangent = problem(case, variant, mixes)
         padded = np.asarray(field.receiver) == QUERIES
@@ -354,7 +355,7 @@ def test_padding_contributes_nothing_to_values_and_gradients(
 def test_rotation_turns_offsets_and_keeps_products(case, seed):
     turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
     turned = [
-        mc.Oriented(
+        rf.Oriented(
             (points.position @ turn.T).astype(np.float32),
             (points.normal @ turn.T).astype(np.float32),
             points.mask,
@@ -392,7 +393,7 @@ def area_of(position, radius):
     grid = build_grid(position, mask, radius)
     limit = EdgeLimit(1 << 14, 1 << 18, 1 << 12, 1 << 17)
     edges = radius_edges(grid, position, mask, radius, limit)
-    return mc.point_area(position, mask, edges, radius), edges.demand
+    return rf.point_area(position, mask, edges, radius), edges.demand
 
 
 def test_area_of_a_flat_square():
@@ -430,7 +431,7 @@ def test_tiles_change_nothing(monkeypatch):
     """Several tiles, the last one overlapping the one before, and padding after it."""
     rng = np.random.default_rng(2)
     edges, count, rows = 100, 83, 9
-    field = mc.Field(
+    field = rf.Field(
         rng.integers(0, rows, edges).astype(np.int32),
         np.where(np.arange(edges) < count, rng.integers(0, rows, edges), rows).astype(
             np.int32
@@ -452,7 +453,7 @@ def test_tiles_change_nothing(monkeypatch):
         return jax.jit(jax.value_and_grad(total, argnums=(0, 1, 2, 3)))(*arguments)
 
     whole = results()
-    monkeypatch.setattr(mc, "TILE", 32)
+    monkeypatch.setattr(rf, "TILE", 32)
     parts = results()
     jax.tree.map(
         partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5), parts, whole
@@ -466,7 +467,7 @@ def test_gathered_columns_have_the_gradient_of_a_gather():
     index = jnp.asarray(rng.integers(0, 6, 10), jnp.int32)
 
     def total(table):
-        taken = mc.take_columns(table, index, jnp.int32(7))
+        taken = rf.take_columns(table, index, jnp.int32(7))
         return jnp.sum(jnp.where(np.arange(10) < 7, taken**2, 0.0))
 
     slope, values = np.zeros((2, 6)), np.asarray(table)

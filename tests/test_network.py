@@ -26,8 +26,8 @@ from ginn_jax.geometry import (
     limit_names,
     uniform_limits,
 )
-from ginn_jax.mcconv import Field, Oriented
 from ginn_jax.network import Encoder, Shader
+from ginn_jax.receptive_field import Field, Oriented
 
 # From the authors' release: levels, radius, bandwidth, channels, channels with skip,
 # parameters of the kernel for 5 attributes, and of the 1x1 layer before it.

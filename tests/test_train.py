@@ -17,7 +17,7 @@ import tiny
 from ginn_jax import train
 from ginn_jax.architecture import compact_network
 from ginn_jax.geometry import Geometry, exceeded, uniform_limits
-from ginn_jax.mcconv import Oriented
+from ginn_jax.receptive_field import Oriented
 
 ONE_LEVEL = compact_network(k=2, levels=(0.08,), query_radius=0.16, latent=2)
 ONE_LEVEL_LIMITS = uniform_limits(ONE_LEVEL, 32768)

@@ -1,0 +1,199 @@
+"""Receptive fields: what every edge shows a kernel, and what its sender weighs.
+
+A sender's weight is what remains of the density of the Monte Carlo estimate (paper,
+appendix; `mcconv` has the sum). No parameter enters it:
+
+    kde      w_j = 1 / sum_{k in N(x)} G((y_k - y_j) / (h r)), the paper's, for every
+             pair of neighbours of every receiver: O(|N|^2)
+    surface  w_j = A_j / (pi r^2), where A_j is the area that sender j stands for, once
+             for every sender: O(|N|), and unmoved by a change of sampling density
+
+Edges are taken in tiles that fit a core's cache, as many as hold real edges: padding
+costs memory, not time.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ginn_jax.packets import Edges
+from ginn_jax.voxels import expand_ranges
+
+TILE = 8192
+
+
+class Field(NamedTuple):
+    """Edges with what the kernel sees and the weight of each.
+
+    The first `count` edges are real; the others weigh zero.
+    """
+
+    sender: Int[Array, "E"]
+    receiver: Int[Array, "E"]
+    inputs: Float[Array, "D E"]
+    weight: Float[Array, "E"]
+    count: Int[Array, ""]
+
+
+class Oriented(NamedTuple):
+    """Points with unit normals, some of them padding."""
+
+    position: Float[Any, "N 3"]
+    normal: Float[Any, "N 3"]
+    mask: Bool[Any, "N"]
+
+
+def tile_size(edges: int) -> int:
+    """Edges of a tile: everything at once where there is no cache to fit."""
+    return min(TILE, edges) if jax.default_backend() == "cpu" else edges
+
+
+def tile_count(edges: int, count: Int[Array, ""]) -> Int[Array, ""]:
+    """Tiles with real edges."""
+    size = tile_size(edges)
+    return (jnp.minimum(count, edges) + size - 1) // size
+
+
+def edge_offsets(
+    senders: Float[Array, "N 3"], receivers: Float[Array, "M 3"], edges: Edges
+) -> tuple[Float[Array, "3 E"], Bool[Array, "E"]]:
+    """x - y of every edge, zero where padded, and which edges are real."""
+    real = edges.receiver < receivers.shape[0]
+    receiver = jnp.where(real, edges.receiver, 0)
+    offset = receivers.T[:, receiver] - senders.T[:, edges.sender]
+    return jnp.where(real, offset, 0.0), real
+
+
+def kernel_inputs(
+    senders: Oriented,
+    receivers: Oriented,
+    edges: Edges,
+    radius: Float[Array, ""],
+    oriented: bool,
+) -> Float[Array, "D E"]:
+    """The offset o = (x - y) / r; if `oriented`, also n_x.o, n_y.o, n_x.n_y, |o|^2.
+
+    The paper's kernels see the offset only. The four products tell a kernel which side
+    of either surface the other point lies on, whatever the azimuth.
+    """
+    real = edges.receiver < receivers.position.shape[0]
+    ends = (receivers, jnp.where(real, edges.receiver, 0)), (senders, edges.sender)
+    x, y = (
+        take_columns(
+            jnp.concatenate([p.position, p.normal], axis=1).T, index, edges.demand.edges
+        )
+        for p, index in ends
+    )
+    offset, normal_x, normal_y = (x[:3] - y[:3]) / radius, x[3:], y[3:]
+    if not oriented:
+        return jnp.where(real, offset, 0.0)
+    pairs = (
+        (normal_x, offset),
+        (normal_y, offset),
+        (normal_x, normal_y),
+        (offset, offset),
+    )
+    products = [jnp.sum(a * b, axis=0, keepdims=True) for a, b in pairs]
+    return jnp.where(real, jnp.concatenate([offset, *products]), 0.0)
+
+
+@jax.custom_vjp
+def take_columns(
+    table: Float[Array, "C N"], index: Int[Array, "E"], count: Int[Array, ""]
+) -> Float[Array, "C E"]:
+    """`table[:, index]` for the first `count` indices, in tiles; further ones may be 0.
+
+    A loop of its own, so that XLA does not gather anew for each use of the result.
+    """
+    size = tile_size(index.shape[0])
+
+    def take(number: Int[Array, ""], taken: Float[Array, "C E"]) -> Array:
+        start = jnp.minimum(number * size, index.shape[0] - size)
+        some = jax.lax.dynamic_slice_in_dim(index, start, size)
+        return jax.lax.dynamic_update_slice_in_dim(taken, table[:, some], start, axis=1)
+
+    tiles = tile_count(index.shape[0], count)
+    nothing = jnp.zeros((table.shape[0], index.shape[0]), table.dtype)
+    return jax.lax.fori_loop(0, tiles, take, nothing)
+
+
+def _take_forward(
+    table: Float[Array, "C N"], index: Int[Array, "E"], count: Int[Array, ""]
+) -> tuple[Float[Array, "C E"], Any]:
+    return take_columns(table, index, count), (table, index, count)
+
+
+def _take_backward(inputs: Any, cotangent: Float[Array, "C E"]) -> Any:
+    table, index, count = inputs
+    real = jnp.arange(index.shape[0]) < count
+    given = jnp.where(real, cotangent, 0.0)
+    return jnp.zeros_like(table).at[:, index].add(given), None, None
+
+
+take_columns.defvjp(_take_forward, _take_backward)
+
+
+def kde_weight(
+    senders: Float[Array, "N 3"],
+    receivers: Float[Array, "M 3"],
+    edges: Edges,
+    radius: Float[Array, ""],
+    bandwidth: float,
+    pairs: int,
+) -> tuple[Float[Array, "E"], Int[Array, ""]]:
+    """The paper's weight of each edge, and the number of pairs it looked at.
+
+    Gaussian kernel density of width h r in units where r = 1, evaluated at the sender
+    over all senders of the same receiver, itself included. `pairs` is a capacity.
+    """
+    count = receivers.shape[0]
+    first = jnp.searchsorted(edges.receiver, jnp.arange(count + 1)).astype(jnp.int32)
+    real = edges.receiver < count
+    receiver = jnp.where(real, edges.receiver, 0)
+    length = jnp.where(real, first[receiver + 1] - first[receiver], 0)
+    slots, demand = expand_ranges(first[receiver], length, pairs)
+    mine, other = edges.sender[slots.owner], edges.sender[slots.row]
+    offset = (senders[other] - senders[mine]) / (radius * bandwidth)
+    constant = (0.5 / jnp.pi) ** 1.5 / bandwidth**3
+    value = constant * jnp.exp(-0.5 * jnp.sum(offset**2, axis=-1))
+    density = jax.ops.segment_sum(
+        jnp.where(slots.valid, value, 0.0),
+        slots.owner,
+        edges.sender.shape[0],
+        indices_are_sorted=True,
+    )
+    return jnp.where(real, 1 / jnp.where(real, density, 1.0), 0.0), demand
+
+
+def point_area(
+    position: Float[Array, "N 3"],
+    mask: Bool[Array, "N"],
+    edges: Edges,
+    radius: Float[Array, ""],
+) -> Float[Array, "N"]:
+    """Area each point stands for, from the edges of the cloud with itself.
+
+    The inverse of a density by the quartic kernel (1 - d^2 / r^2)^2, whose integral
+    over a flat surface is pi r^2 / 3.
+    """
+    offset, real = edge_offsets(position, position, edges)
+    value = (1 - jnp.sum(offset**2, axis=0) / radius**2) ** 2
+    total = jax.ops.segment_sum(
+        jnp.where(real, value, 0.0),
+        edges.receiver,
+        position.shape[0],
+        indices_are_sorted=True,
+    )
+    # The point itself adds 1; a smaller total belongs to a padded row.
+    area = jnp.pi * radius**2 / 3 / jnp.maximum(total, 1.0)
+    return jnp.where(mask, area, 0.0)
+
+
+def surface_weight(
+    area: Float[Array, "N"], edges: Edges, receivers: int, radius: Float[Array, ""]
+) -> Float[Array, "E"]:
+    """Area of each edge's sender relative to the disk of the receptive field."""
+    real = edges.receiver < receivers
+    return jnp.where(real, area[edges.sender] / (jnp.pi * radius**2), 0.0)
