@@ -50,6 +50,7 @@ from ginn_jax.network import Variables
 from ginn_jax.receptive_field import Oriented
 from ginn_jax.reference import build_scene
 from ginn_jax.train import Training, init_state
+from ginn_jax.voxels import morton_order
 
 UNSEEN_SEED = 20_000_000
 ASKED = 4096
@@ -144,12 +145,21 @@ def _demands(
     network: Network, limits: Limits, cloud: Oriented, blocks: Oriented
 ) -> Demands:
     """What f_3D and every block of f_2D need."""
+    cloud = _coherent(cloud)
     geometry, demands = build_geometry(network, limits, cloud, key=jax.random.key(0))
     ends = geometry.levels[0], geometry.grid, geometry.area
-    needs = jax.lax.map(
-        lambda block: build_query_field(network, limits, *ends, block)[1], blocks
-    )
+
+    def needs_of(block: Oriented) -> Demands:
+        return build_query_field(network, limits, *ends, _coherent(block))[1]
+
+    needs = jax.lax.map(needs_of, blocks)
     return demands | jax.tree.map(lambda need: jnp.max(need), needs)
+
+
+def _coherent(points: Oriented) -> Oriented:
+    """Points in the order in which `image` searches them."""
+    order = morton_order(points.position, points.mask)
+    return Oriented(*(a[order] for a in points))
 
 
 def tight_limits(network: Network, subject: Subject) -> Limits:
@@ -161,7 +171,8 @@ def tight_limits(network: Network, subject: Subject) -> Limits:
     flat = _padded(position, normal, -(-len(position) // BLOCK) * BLOCK)
     blocks = jax.tree.map(lambda a: a.reshape(-1, BLOCK, *a.shape[1:]), flat)
     names = limit_names(network)
-    rows = [1 << (15 if name.endswith("points") else 20) for name in names]
+    powers = {"points": 15, "words": 14}
+    rows = [1 << powers.get(name.split(".")[1], 20) for name in names]
     generous = Limits(tuple(zip(names, rows, strict=True)))
 
     def probe(limits: Limits, _: int) -> Demands:
