@@ -92,7 +92,7 @@ def warp_hash_grid() -> Search:
         found: wp.array(dtype=wp.int32),
     ):
         i = wp.tid()
-        total = 0
+        total = wp.int32(0)  # a variable; a plain 0 is a constant to Warp
         for j in wp.hash_grid_query(grid, queries[i], radius):
             if wp.length_sq(queries[i] - points[j]) < radius * radius:
                 if found:
