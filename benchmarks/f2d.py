@@ -113,7 +113,7 @@ def compare(
     encoded, limits = image.encode_cloud(
         network, limits, variables, cloud.position, cloud.normal, key=key
     )
-    flat = tuple((n, 64) for n, _ in limits.sizes if n.startswith("query."))
+    flat = tuple((n, 4096) for n, _ in limits.sizes if n.startswith("query."))
     limits = Limits((*(s for s in limits.sizes if s[0] not in dict(flat)), *flat))
     pixels = gbuffer.position, gbuffer.normal, gbuffer.mask
     _, limits = image.shade_image(network, limits, variables, encoded, *pixels)

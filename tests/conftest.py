@@ -22,3 +22,10 @@ def unchecked():
     config.update("jaxtyping_disable", True)
     yield
     config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _forget_compilations():
+    """Each module's own: thousands of kernels exhaust the maps a process may have."""
+    yield
+    jax.clear_caches()

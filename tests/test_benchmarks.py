@@ -213,7 +213,7 @@ def test_mc_conv_compares_with_a_peer():
 def test_scaling(tmp_path, monkeypatch):
     monkeypatch.setattr(scaling, "network_for", lambda _: tiny.NETWORK)
     options = scaling.Options(
-        tmp_path, points=(600, 1200), resolutions=(32, 64), repeats=1
+        tmp_path, points=(600, 700), resolutions=(32, 64), repeats=1
     )
     with tiny.cheap_compiling():
         metrics = scaling.main(options)
