@@ -163,6 +163,7 @@ def test_poisson_radii(tmp_path, monkeypatch, trained):
 def test_f2d(tmp_path, monkeypatch):
     """Ours and the straightforward form agree, or `compare` raises."""
     monkeypatch.setattr(f2d, "compact_network", lambda **_: tiny.NETWORK)
+    monkeypatch.setattr(f2d, "uniform_limits", lambda *_: tiny.LIMITS)
     options = f2d.Options(
         tmp_path, resolution=48, disks=(0.08,), radii=(0.16,), rays=(1,), repeats=1
     )
