@@ -160,8 +160,7 @@ def block_memory(
     rows = image.BLOCK
     zeros = np.zeros((rows, 3), np.float32)
     queries = Oriented(zeros, zeros, np.ones(rows, bool))
-    names = {n for n, _ in limits.sizes if n.startswith("query.")}
-    flat = Limits(tuple(s for s in limits.sizes if s[0] in names))
+    flat = image.only(limits, network.query.name)
     shade = jax.jit(image.shade, static_argnums=(0, 1))
     compiled = shade.lower(network, flat, variables, encoded, queries).compile()
     memory = compiled.memory_analysis()

@@ -47,10 +47,9 @@ from ginn_jax.mesh import Samples, find_meshes
 from ginn_jax.metrics import mse
 from ginn_jax.neighbors import bucket, pad_rows
 from ginn_jax.network import Variables
-from ginn_jax.receptive_field import Oriented
+from ginn_jax.receptive_field import Oriented, in_coherent_order
 from ginn_jax.reference import build_scene
 from ginn_jax.train import Training, init_state
-from ginn_jax.voxels import morton_order
 
 UNSEEN_SEED = 20_000_000
 ASKED = 4096
@@ -145,21 +144,16 @@ def _demands(
     network: Network, limits: Limits, cloud: Oriented, blocks: Oriented
 ) -> Demands:
     """What f_3D and every block of f_2D need."""
-    cloud = _coherent(cloud)
+    cloud, _ = in_coherent_order(cloud)
     geometry, demands = build_geometry(network, limits, cloud, key=jax.random.key(0))
     ends = geometry.levels[0], geometry.grid, geometry.area
 
     def needs_of(block: Oriented) -> Demands:
-        return build_query_field(network, limits, *ends, _coherent(block))[1]
+        queries, _ = in_coherent_order(block)
+        return build_query_field(network, limits, *ends, queries)[1]
 
     needs = jax.lax.map(needs_of, blocks)
     return demands | jax.tree.map(lambda need: jnp.max(need), needs)
-
-
-def _coherent(points: Oriented) -> Oriented:
-    """Points in the order in which `image` searches them."""
-    order = morton_order(points.position, points.mask)
-    return Oriented(*(a[order] for a in points))
 
 
 def tight_limits(network: Network, subject: Subject) -> Limits:

@@ -27,9 +27,9 @@ from ginn_jax.geometry import (
 from ginn_jax.neighbors import bucket, pad_rows
 from ginn_jax.network import Encoder, Shader, Variables
 from ginn_jax.process import ALONE
-from ginn_jax.receptive_field import Oriented
+from ginn_jax.receptive_field import Oriented, in_coherent_order
 from ginn_jax.upsample import Surface, sample_pixels, upsample
-from ginn_jax.voxels import VoxelGrid, morton_order
+from ginn_jax.voxels import VoxelGrid
 
 BLOCK = 1 << 14
 SLACK = 1.25
@@ -52,8 +52,7 @@ def encode(
     key: Key[Array, ""],
 ) -> tuple[Encoded, Demands]:
     """f_3D with all its geometry."""
-    order = morton_order(cloud.position, cloud.mask)
-    cloud = jax.tree.map(lambda a: a[order], cloud)
+    cloud, _ = in_coherent_order(cloud)
     geometry, demands = build_geometry(network, limits, cloud, key=key)
     codes: Any = Encoder(network, train=False).apply(
         variables["encoder"], geometry.levels[0].normal, geometry
@@ -70,8 +69,7 @@ def shade(
     queries: Oriented,
 ) -> tuple[Float[Array, "M"], Demands]:
     """f_2D with its search, for one block of queries in any order."""
-    order = morton_order(queries.position, queries.mask)
-    queries = jax.tree.map(lambda a: a[order], queries)
+    queries, order = in_coherent_order(queries)
     field, demands = build_query_field(
         network, limits, encoded.points, encoded.grid, encoded.area, queries
     )
@@ -117,7 +115,7 @@ def encode_cloud(
         limits = raise_limits(limits, short, SLACK)
 
 
-def _only(limits: Limits, conv: str) -> Limits:
+def only(limits: Limits, conv: str) -> Limits:
     """The limits of one convolution: others must not make it compile again."""
     return Limits(tuple(s for s in limits.sizes if s[0].startswith(f"{conv}.")))
 
@@ -140,7 +138,7 @@ def shade_points(
     size = min(BLOCK, bucket(len(position)))
     while True:
         parts, demands = [], []
-        flat = _only(limits, network.query.name)
+        flat = only(limits, network.query.name)
         for number, first in enumerate(range(0, len(position), size)):
             block = slice(first, first + size)
             place, mask = pad_rows(np.asarray(position[block], np.float32), size)

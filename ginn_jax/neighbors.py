@@ -14,7 +14,6 @@ from ginn_jax.errors import InputError
 from ginn_jax.packets import (
     PACKET,
     Candidates,
-    Columns,
     Words,
     count_words,
     list_bits,
@@ -144,13 +143,6 @@ def _decide(
     return Pairs(*(np.delete(column, wrong) for column in pairs))
 
 
-@partial(jax.jit, static_argnames=("columns", "capacity"))
-def _candidates(
-    grid: VoxelGrid, under: Columns, columns: int, capacity: int
-) -> tuple[Candidates, Int[Array, ""]]:
-    return packet_candidates(grid, under, columns, capacity)
-
-
 @jax.jit
 def _turn(
     query: Float[Array, "M 3"], mask: Bool[Array, "M"]
@@ -190,3 +182,4 @@ def _list(
 
 _build_grid = jax.jit(build_grid)
 _columns = jax.jit(packet_columns)
+_candidates = jax.jit(packet_candidates, static_argnums=(2, 3))

@@ -1,11 +1,12 @@
 """Radius search by packets of queries: jit-compatible, fixed capacity, nothing dropped.
 
-Packets of 32 consecutive queries share one list of candidates, the points within the
-radius of the packet's bounding box. What is left for the single query is a dense test
-against 32 candidates at a time, whose outcome is one word of bits; edges are listed by
-counting and selecting bits. So the cost is that of the edges, not of the candidates.
+Packets of 32 consecutive queries share one list of candidates, the points in the grid
+columns and layers within the radius of the packet's bounding box. What is left for the
+single query is a dense test against 32 candidates at a time, whose outcome is one word
+of bits; edges are listed by counting and selecting bits. So the cost is that of the
+edges, not of the candidates.
 Queries may come in any order: a packet that is spread out costs time, never an edge.
-`voxels.morton_order`, or the tiles of an image, keep packets small.
+`voxels.morton_order` keeps packets small.
 """
 
 from collections.abc import Callable
@@ -81,7 +82,7 @@ class Candidates(NamedTuple):
 
 
 class Words(NamedTuple):
-    """Bit b of `word[l, q]`: `query[l, q]` is closer to the list's candidate b.
+    """Bit b of `word[l, q]`: query `query[l, q]` is near the list's candidate b.
 
     One list is 32 candidates of one packet. `order` are the rows of the flat words by
     query, and under a query by list; padding comes last.

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ginn_jax.packets import Edges
-from ginn_jax.voxels import expand_ranges
+from ginn_jax.voxels import expand_ranges, morton_order
 
 TILE = 8192
 
@@ -43,6 +43,12 @@ class Oriented(NamedTuple):
     position: Float[Any, "N 3"]
     normal: Float[Any, "N 3"]
     mask: Bool[Any, "N"]
+
+
+def in_coherent_order(points: Oriented) -> tuple[Oriented, Int[Array, "N"]]:
+    """The points as searches like them, neighbours together, and their old rows."""
+    order = morton_order(points.position, points.mask)
+    return jax.tree.map(lambda a: a[order], points), order
 
 
 def tile_size(edges: int) -> int:
