@@ -12,7 +12,10 @@ Modules, in the order the data flows; each imports only what stands before it:
     orientation, mesh triangles: loading, mending, unit box, ground, surface samples
     sdf, solids, *_shapes, shapes    the seeded source of procedural objects
     camera            pinhole cameras
-    libllvm, reference    ground truth by ray tracing (the only use of a renderer)
+    libllvm, renderer the ray tracer, found and loaded
+    reference         ambient occlusion and G-buffers by ray tracing
+    lighting          environment maps, procedural skies, point lights
+    irradiance        direct and indirect irradiance by path tracing
     voxels            fixed-capacity voxel hash under jit
     packets           radius search by packets of queries under jit
     neighbors         radius search on the host: exact, sizes itself

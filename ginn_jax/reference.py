@@ -1,22 +1,18 @@
 """Ground truth by ray tracing: ambient occlusion and the G-buffer of a camera.
 
-The only module that imports Mitsuba, on first use; everything it returns is NumPy.
-Points and pixels go through the same `ambient_occlusion`. Mitsuba's variant is
-process-global state: it is set inside each call and put back after it.
+Everything returned is NumPy; points and pixels go through the same functions. Mitsuba's
+variant is process-global state: it is set inside each call and put back after it.
 """
 
-import ctypes
-import functools
-import sys
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt
 
-from ginn_jax import libllvm
 from ginn_jax.camera import Camera, pixel_directions
 from ginn_jax.errors import InputError
 from ginn_jax.mesh import Mesh
+from ginn_jax.renderer import use_mitsuba
 
 RAYS_PER_LAUNCH = 2**22
 # Rays start this far off the surface, relative to the largest coordinate: about 160
@@ -93,7 +89,7 @@ def build_scene(mesh: Mesh) -> Scene:
         raise InputError("mesh has non-finite vertices: drop or mend them")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"mesh faces name vertices outside 0..{len(vertices) - 1}")
-    mi, variant = _mitsuba()
+    mi, variant = use_mitsuba()
     with mi.variant_context(variant):
         shape = mi.Mesh("mesh", len(vertices), len(faces))
         params = mi.traverse(shape)
@@ -117,7 +113,7 @@ def _count_blocked(
     One lane a ray, so that the rays of a point are traced side by side. Numbers that
     change between calls are opaque, or each would compile a kernel of its own.
     """
-    mi, variant = _mitsuba()
+    mi, variant = use_mitsuba()
     import drjit as dr
 
     largest = float(np.abs(scene.mesh.vertices).max())
@@ -128,18 +124,18 @@ def _count_blocked(
         point = lane // dr.opaque(mi.UInt32, rays)
         ray = lane - point * dr.opaque(mi.UInt32, rays)
         number = point + dr.opaque(mi.UInt32, first)
-        a, b = _random_pair(number, ray, dr.opaque(mi.UInt32, seed))
+        a, b = random_pair(number, ray, dr.opaque(mi.UInt32, seed))
         square = mi.Point2f(mi.Float(a >> 8) * 2**-24, mi.Float(b >> 8) * 2**-24)
         hemisphere = mi.warp.square_to_cosine_hemisphere(square)
-        normal = dr.gather(mi.Normal3f, mi.Normal3f(_columns(normals)), point)
-        origin = dr.gather(mi.Point3f, mi.Point3f(_columns(start)), point)
+        normal = dr.gather(mi.Normal3f, mi.Normal3f(columns(normals)), point)
+        origin = dr.gather(mi.Point3f, mi.Point3f(columns(start)), point)
         cast = mi.Ray3f(origin, mi.Frame3f(normal).to_world(hemisphere))
         cast.maxt = dr.opaque(mi.Float, radius)
         blocked = dr.select(scene.handle.ray_test(cast), mi.UInt32(1), mi.UInt32(0))
         return dr.block_reduce(dr.ReduceOp.Add, blocked, rays).numpy()
 
 
-def _random_pair(x: Any, y: Any, z: Any) -> tuple[Any, Any]:
+def random_pair(x: Any, y: Any, z: Any) -> tuple[Any, Any]:
     """Two random words from three words: `pcg3d` of Jarzynski and Olano, JCGT 2020.
 
     Hashing (point, ray, seed) makes the rays the same however points are chunked.
@@ -159,10 +155,10 @@ def _random_pair(x: Any, y: Any, z: Any) -> tuple[Any, Any]:
 def render_gbuffer(mesh: Mesh | Scene, camera: Camera) -> GBuffer:
     """Position, face normal (towards the camera) and material through pixel centres."""
     scene = mesh if isinstance(mesh, Scene) else build_scene(mesh)
-    mi, variant = _mitsuba()
+    mi, variant = use_mitsuba()
     directions = pixel_directions(camera)
     with mi.variant_context(variant):
-        ray = mi.Ray3f(mi.Point3f(*camera.origin), mi.Vector3f(_columns(directions)))
+        ray = mi.Ray3f(mi.Point3f(*camera.origin), mi.Vector3f(columns(directions)))
         hit = scene.handle.ray_intersect_preliminary(ray)
         mask = hit.is_valid().numpy()
         face = np.where(mask, hit.prim_index.numpy(), 0)
@@ -186,51 +182,13 @@ def render_gbuffer(mesh: Mesh | Scene, camera: Camera) -> GBuffer:
     )
 
 
-def _cuda_usable() -> bool:
-    """Whether there is an NVIDIA GPU whose driver brings OptiX, which Mitsuba needs."""
-    try:
-        ctypes.CDLL("libnvoptix.so.1")
-        driver, count = ctypes.CDLL("libcuda.so.1"), ctypes.c_int(0)
-    except OSError:
-        return False
-    return (
-        driver.cuInit(0) == 0
-        and driver.cuDeviceGetCount(ctypes.byref(count)) == 0
-        and count.value > 0
-    )
-
-
-@functools.cache
-def _mitsuba() -> tuple[Any, str]:
-    """Mitsuba's module and the variant to use: on the GPU if there is a usable one."""
-    variant = "cuda_ad_rgb" if _cuda_usable() else "llvm_ad_rgb"
-    if variant == "llvm_ad_rgb" and "drjit" not in sys.modules:
-        libllvm.use_libllvm()
-    try:
-        import drjit
-        import mitsuba
-    except (ImportError, NameError) as error:  # Dr.Jit hides what it misses
-        raise InputError(
-            f"Mitsuba cannot be loaded ({error.__context__ or error}): install what is "
-            "missing, such as `apt-get install libatomic1`"
-        ) from error
-    if variant == "llvm_ad_rgb":
-        # The caller may have imported Dr.Jit before, with what it found (-1: nothing).
-        major = drjit.detail.llvm_version()[0]
-        if major < libllvm.OLDEST_LLVM:
-            found = "none usable" if major < 0 else f"LLVM {major}, loaded"
-            raise libllvm.llvm_missing(found)
-    if mitsuba.variant() is None:  # `variant_context` cannot put back no variant
-        mitsuba.set_variant(variant)
-    return mitsuba, variant
-
-
-def _columns(rows: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 n"]:
+def columns(rows: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 n"]:
+    """Rows as the renderer's vectors take them."""
     return np.ascontiguousarray(np.asarray(rows, np.float32).T)
 
 
-def _check_rays(points: Any, normals: Any, radius: float, rays: int, seed: int) -> None:
-    """Raise `InputError` unless these can be cast."""
+def check_points(points: Any, normals: Any) -> None:
+    """Raise `InputError` unless rays can start there."""
     points, normals = np.asarray(points), np.asarray(normals)
     if points.ndim != 2 or points.shape[1] != 3 or normals.shape != points.shape:
         raise InputError(
@@ -240,6 +198,11 @@ def _check_rays(points: Any, normals: Any, radius: float, rays: int, seed: int) 
         raise InputError("points are not finite: drop those rows")
     if not np.all(np.abs(np.einsum("ij,ij->i", normals, normals) - 1) < 2e-3):
         raise InputError("normals are not of unit length: divide them by their length")
+
+
+def _check_rays(points: Any, normals: Any, radius: float, rays: int, seed: int) -> None:
+    """Raise `InputError` unless these can be cast."""
+    check_points(points, normals)
     if not 0 < radius < np.inf:
         raise InputError(f"radius {radius} must be positive and finite")
     if not 1 <= rays <= RAYS_PER_LAUNCH:

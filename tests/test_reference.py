@@ -155,7 +155,7 @@ def test_seed_decides_and_chunks_do_not(monkeypatch):
 def test_random_numbers_of_points_rays_and_seeds_are_independent(axis):
     """Averages over any of the three vary as much as those of independent numbers."""
     words = np.indices((1000, 16, 16), np.uint32)
-    a, b = (word / 2**32 for word in reference._random_pair(*words))
+    a, b = (word / 2**32 for word in reference.random_pair(*words))
     disk, checks = (a - 0.5) ** 2 + (b - 0.5) ** 2 < 0.1, (a * 64 % 2 < 1) ^ (b < 0.5)
     for event, p in [
         (a < 0.5, 0.5),
@@ -334,12 +334,12 @@ def test_a_name_without_version_is_not_usable():
 
 OLD_ONLY = """
 import sys
-from ginn_jax import libllvm, reference
+from ginn_jax import libllvm, renderer
 from ginn_jax.errors import InputError
-reference._cuda_usable = lambda: False
+renderer._cuda_usable = lambda: False
 libllvm.installed_libllvm = lambda: ["/usr/lib/llvm-14/lib/libLLVM-14.so.1"]
 try:
-    reference._mitsuba()
+    renderer.use_mitsuba()
 except InputError as error:
     print(error)
 assert "drjit" not in sys.modules

@@ -1,0 +1,217 @@
+"""Ground truth of global illumination: direct and indirect irradiance by path tracing.
+
+Points and pixels go through the same functions. All surfaces are diffuse; materials are
+an RGB albedo for each material index of the mesh (0 object, 1 ground).
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ginn_jax.errors import InputError
+from ginn_jax.lighting import EnvironmentMap, Light
+from ginn_jax.mesh import Mesh
+from ginn_jax.reference import OFFSET, check_points, columns, random_pair
+from ginn_jax.renderer import use_mitsuba
+
+PATHS_PER_LAUNCH = 2**22
+# Fractional parts of multiples of these fill the square evenly (Roberts 2018, R2).
+LATTICE = (0.7548776662466927, 0.5698402909980532)
+
+
+class LitScene(NamedTuple):
+    """A mesh with materials under one light, made by `light_scene`."""
+
+    mesh: Mesh
+    light: Light
+    handle: Any
+
+
+class ColorEstimate(NamedTuple):
+    """A Monte Carlo mean and the unbiased variance of that mean, for each point."""
+
+    mean: Float[np.ndarray, "N 3"]
+    variance: Float[np.ndarray, "N 3"]
+
+
+def light_scene(mesh: Mesh, albedo: Float[np.ndarray, "K 3"], light: Light) -> LitScene:
+    """The scene that rays are traced in; `albedo[k]` is that of material k.
+
+    Raises `InputError` for an albedo outside [0, 1] or a material without one.
+    """
+    albedo = np.asarray(albedo, np.float64)
+    if albedo.ndim != 2 or albedo.shape[1] != 3 or not (albedo >= 0).all():
+        raise InputError(f"albedo {albedo.shape} must be [K 3] and not negative")
+    if not (albedo <= 1).all():
+        raise InputError("an albedo above 1 would make light: give it in [0, 1]")
+    if mesh.material.max() >= len(albedo):
+        raise InputError(f"the mesh has materials up to {mesh.material.max()}")
+    mi, variant = use_mitsuba()
+    with mi.variant_context(variant):
+        parts: dict[str, Any] = {"type": "scene", "light": emitter(light)}
+        parts |= {
+            f"material_{k}": _shape(mesh, k, albedo[k]) for k in set(mesh.material)
+        }
+        return LitScene(mesh, light, mi.load_dict(parts))
+
+
+def emitter(light: Light) -> dict[str, Any]:
+    """The light as a Mitsuba dictionary; call it with the variant set."""
+    mi, _ = use_mitsuba()
+    if isinstance(light, EnvironmentMap):
+        return {"type": "envmap", "bitmap": mi.Bitmap(light.radiance)}
+    return {
+        "type": "point",
+        "position": [float(x) for x in light.position],
+        "intensity": {"type": "rgb", "value": [float(x) for x in light.intensity]},
+    }
+
+
+def _shape(mesh: Mesh, material: int, albedo: Float[np.ndarray, "3"]) -> Any:
+    """The faces of one material as a Mitsuba mesh with flat normals."""
+    mi, _ = use_mitsuba()
+    faces = mesh.faces[mesh.material == material]
+    used, faces = np.unique(faces, return_inverse=True)
+    color = {"type": "rgb", "value": [float(x) for x in albedo]}
+    surface = {"type": "diffuse", "reflectance": color}
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict({"type": "twosided", "surface": surface})
+    shape = mi.Mesh("mesh", len(used), faces.size // 3, properties)
+    params = mi.traverse(shape)
+    params["vertex_positions"] = np.asarray(mesh.vertices[used], np.float32).ravel()
+    params["faces"] = faces.astype(np.uint32).ravel()
+    params.update()
+    return shape
+
+
+def direct_irradiance(
+    scene: LitScene,
+    points: Float[np.ndarray, "N 3"],
+    normals: Float[np.ndarray, "N 3"],
+    *,
+    samples: int,
+    seed: int,
+) -> Float[np.ndarray, "N 3"]:
+    """Irradiance that arrives from the light unbounced.
+
+    Every point looks at the light in `samples` directions, drawn in proportion to its
+    radiance from a lattice that is shifted at random; one is enough for a point light.
+    """
+    check_points(points, normals)
+    samples = samples if isinstance(scene.light, EnvironmentMap) else 1
+    size = max(1, min(PATHS_PER_LAUNCH // samples, len(points)))
+    parts = [
+        _direct(scene, points[i : i + size], normals[i : i + size], i, samples, seed)
+        for i in range(0, len(points), size)
+    ]
+    return np.concatenate([np.zeros((0, 3), np.float32), *parts])
+
+
+def _direct(
+    scene: LitScene,
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    first: int,
+    samples: int,
+    seed: int,
+) -> Float[np.ndarray, "n 3"]:
+    mi, variant = use_mitsuba()
+    import drjit as dr
+
+    with mi.variant_context(variant):
+        point, ray, at, normal = _lanes(scene, points, normals, samples)
+        number = point + dr.opaque(mi.UInt32, first)
+        shift = random_pair(number, mi.UInt32(0), dr.opaque(mi.UInt32, seed))
+        square = [
+            mi.Float(s >> 8) * 2**-24 + mi.Float(ray) * step
+            for s, step in zip(shift, LATTICE, strict=True)
+        ]
+        square = mi.Point2f(*(x - dr.floor(x) for x in square))
+        receiver = dr.zeros(mi.SurfaceInteraction3f, len(points) * samples)
+        receiver.p, receiver.n = at, normal
+        toward, radiance = scene.handle.sample_emitter_direction(receiver, square)
+        cosine = dr.fmax(dr.dot(toward.d, normal), 0)
+        arrived = dr.select(toward.pdf > 0, radiance * cosine, 0)
+        total = [dr.block_reduce(dr.ReduceOp.Add, c, samples) for c in arrived]
+        return np.stack([c.numpy() for c in total], axis=1) / samples
+
+
+def indirect_irradiance(
+    scene: LitScene,
+    points: Float[np.ndarray, "N 3"],
+    normals: Float[np.ndarray, "N 3"],
+    *,
+    paths: int,
+    seed: int,
+) -> ColorEstimate:
+    """Irradiance by light that bounced at least once, all bounces.
+
+    pi times the mean of `paths` cosine-distributed path-traced radiances (paper,
+    section "Training Data Generation"); Mitsuba's `path` with hidden emitters.
+    """
+    check_points(points, normals)
+    size = max(1, min(PATHS_PER_LAUNCH // paths, len(points)))
+    parts = [
+        _indirect(scene, points[i : i + size], normals[i : i + size], i, paths, seed)
+        for i in range(0, len(points), size)
+    ]
+    mean, variance = (np.concatenate(c) for c in zip(*parts, strict=True))
+    return ColorEstimate(mean, variance)
+
+
+def _indirect(
+    scene: LitScene,
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    first: int,
+    paths: int,
+    seed: int,
+) -> ColorEstimate:
+    mi, variant = use_mitsuba()
+    import drjit as dr
+
+    with mi.variant_context(variant):
+        _, _, at, normal = _lanes(scene, points, normals, paths)
+        sampler = mi.load_dict({"type": "independent"})
+        number = np.random.SeedSequence((seed, first)).generate_state(1)[0]
+        sampler.seed(dr.opaque(mi.UInt32, int(number)), len(points) * paths)
+        local = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
+        cast = mi.Ray3f(at, mi.Frame3f(normal).to_world(local))
+        integrator = mi.load_dict({"type": "path", "hide_emitters": True})
+        radiance, _, _ = integrator.sample(scene.handle, sampler, cast)
+        return summarize(np.pi * radiance, paths)
+
+
+def summarize(values: Any, paths: int) -> ColorEstimate:
+    """Mean of every `paths` successive values, and the variance of that mean."""
+    import drjit as dr
+
+    def mean(value: Any) -> np.ndarray:
+        total = dr.block_reduce(dr.ReduceOp.Add, value, paths)
+        return total.numpy().astype(np.float64) / paths
+
+    middle = np.stack([mean(c) for c in values], axis=1)
+    square = np.stack([mean(c * c) for c in values], axis=1)
+    spread = np.maximum(square - middle**2, 0.0)
+    variance = spread / (paths - 1) if paths > 1 else np.full_like(spread, np.nan)
+    return ColorEstimate(middle.astype(np.float32), variance.astype(np.float32))
+
+
+def _lanes(
+    scene: LitScene,
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    rays: int,
+) -> tuple[Any, Any, Any, Any]:
+    """Point and ray number of every lane, where it starts, and the normal there."""
+    mi, _ = use_mitsuba()
+    import drjit as dr
+
+    offset = OFFSET * float(np.abs(scene.mesh.vertices).max())
+    start = np.asarray(points, np.float32) + np.float32(offset) * normals
+    lane = dr.arange(mi.UInt32, len(points) * rays)
+    point = lane // dr.opaque(mi.UInt32, rays)
+    ray = lane - point * dr.opaque(mi.UInt32, rays)
+    at = dr.gather(mi.Point3f, mi.Point3f(columns(start)), point)
+    return point, ray, at, dr.gather(mi.Normal3f, mi.Normal3f(columns(normals)), point)

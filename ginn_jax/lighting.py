@@ -1,0 +1,198 @@
+"""Lights: environment maps from files, procedural ones from a seed, point lights.
+
+Radiance is linear RGB. An environment map is a latitude-longitude image: row 0 looks up
+(+y), column u looks along (sin 2 pi u, -cos 2 pi u) in x and z, as in Mitsuba.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ginn_jax.errors import InputError
+from ginn_jax.renderer import use_mitsuba
+
+ENDINGS = (".hdr", ".exr", ".pfm")
+HEIGHT = 256
+# Sky models end at the horizon; below it lies ground of this albedo.
+EARTH = 0.3
+
+
+class EnvironmentMap(NamedTuple):
+    """Radiance from every direction."""
+
+    radiance: Float[np.ndarray, "H W 3"]
+
+
+class PointLight(NamedTuple):
+    """A light at a point, by its radiant intensity."""
+
+    position: Float[np.ndarray, "3"]
+    intensity: Float[np.ndarray, "3"]
+
+
+Light = EnvironmentMap | PointLight
+
+
+def find_environments(path: str | Path) -> list[Path]:
+    """The environment maps in a folder and those below it, sorted; or the one file.
+
+    Raises `InputError` where there is no such file or folder, or no map in it.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder; give environment maps")
+    if path.is_file():
+        return [path]
+    found = sorted(p for p in path.rglob("*") if p.suffix.lower() in ENDINGS)
+    if not found:
+        raise InputError(f"{path}: no {', '.join(ENDINGS)} in this folder")
+    return found
+
+
+def load_environment(path: str | Path) -> EnvironmentMap:
+    """A latitude-longitude map in any format Mitsuba reads, at most 256 rows high.
+
+    Larger maps are averaged down, which keeps the irradiance. Raises `InputError` where
+    the file is missing or unreadable, or its radiance negative, not finite or all zero.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give an environment map")
+    mi, variant = use_mitsuba()
+    with mi.variant_context(variant):
+        try:
+            bitmap = mi.Bitmap(str(path))
+            kind = mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32
+            pixels = np.array(bitmap.convert(*kind, srgb_gamma=False))
+        except RuntimeError as error:
+            reason = str(error).strip().splitlines()[-1]
+            raise InputError(f"{path}: cannot be read ({reason})") from None
+    try:
+        return make_environment(pixels)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def make_environment(radiance: Float[np.ndarray, "H W 3"]) -> EnvironmentMap:
+    """A map from its pixels, checked and averaged down to 256 rows."""
+    if radiance.ndim != 3 or radiance.shape[-1] != 3 or radiance.size == 0:
+        raise InputError(f"an environment map is [H W 3], this is {radiance.shape}")
+    if not np.isfinite(radiance).all():
+        raise InputError("radiance is not finite; mend those pixels")
+    if radiance.min() < 0:
+        raise InputError("radiance is negative; clip it at zero")
+    if radiance.max() == 0:
+        raise InputError("radiance is zero everywhere: the map is empty")
+    factor = max(radiance.shape[0] // HEIGHT, 1)
+    height, width = (n // factor for n in radiance.shape[:2])
+    part = radiance[: height * factor, : width * factor].astype(np.float64)
+    part = part.reshape(height, factor, width, factor, 3).mean(axis=(1, 3))
+    return EnvironmentMap(part.astype(np.float32))
+
+
+def constant_sky(radiance: float = 1.0) -> EnvironmentMap:
+    """The same radiance from everywhere."""
+    return EnvironmentMap(np.full((HEIGHT, 2 * HEIGHT, 3), radiance, np.float32))
+
+
+def sun_and_sky(
+    turbidity: float, direction: Float[np.ndarray, "3"], sun_scale: float = 1.0
+) -> EnvironmentMap:
+    """The clear sky of Hosek and Wilkie with its sun, above ground of albedo .3.
+
+    `direction` points to the sun, y up. The map is the mean of 4 x 4 directions a
+    pixel, so that the sun, smaller than a pixel, is not missed.
+    """
+    mi, variant = use_mitsuba()
+    import drjit as dr
+
+    fine = pixel_directions(4 * HEIGHT)
+    with mi.variant_context(variant):
+        emitter = mi.load_dict(
+            {
+                "type": "sunsky",
+                "turbidity": float(turbidity),
+                "sun_direction": [float(x) for x in direction],
+                "sun_scale": float(sun_scale),
+                "albedo": EARTH,
+                "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90),
+            }
+        )
+        interaction = dr.zeros(mi.SurfaceInteraction3f, fine.size // 3)
+        interaction.wi = mi.Vector3f(np.ascontiguousarray(-fine.reshape(-1, 3).T))
+        values = np.array(emitter.eval(interaction)).T.reshape(fine.shape)
+    sky = make_environment(np.nan_to_num(np.maximum(values, 0.0)))
+    below = pixel_directions(HEIGHT)[..., 1] < 0
+    bounced = EARTH * irradiance_of(sky, np.array([0.0, 1.0, 0.0])) / np.pi
+    return EnvironmentMap(np.where(below[..., None], bounced, sky.radiance))
+
+
+def studio(seed: int) -> EnvironmentMap:
+    """A dim room with one to six soft lamps of any size, colour and place."""
+    rng = np.random.default_rng((seed, 1))
+    toward = pixel_directions(HEIGHT)
+    tint = rng.uniform(0.5, 1.0, (2, 3)) * rng.uniform(0.02, 0.5, (2, 1))
+    height = (toward[..., 1:2] + 1) / 2
+    radiance = tint[0] * height + tint[1] * (1 - height)
+    for _ in range(rng.integers(1, 7)):
+        centre = rng.normal(size=3)
+        centre[1] = abs(centre[1]) if rng.random() < 0.8 else centre[1]
+        centre /= np.linalg.norm(centre)
+        size = np.exp(rng.uniform(np.log(0.03), np.log(0.8)))
+        angle = np.arccos(np.clip(toward @ centre, -1.0, 1.0))
+        edge = np.exp(rng.uniform(np.log(0.02), np.log(0.5))) * size
+        shape = 1 / (1 + np.exp(np.clip((angle - size) / edge, -60, 60)))
+        colour = rng.uniform(0.3, 1.0, 3) * np.exp(rng.uniform(-1.0, 1.0))
+        radiance = radiance + shape[..., None] * colour / (1 - np.cos(size))
+    return EnvironmentMap(radiance.astype(np.float32))
+
+
+def procedural_environment(seed: int) -> EnvironmentMap:
+    """An outdoor sky or a studio, another for every seed, turned at random."""
+    rng = np.random.default_rng((seed, 0))
+    if rng.random() < 0.5:
+        light = studio(seed)
+    else:
+        elevation = np.arcsin(rng.uniform(np.sin(0.05), np.sin(1.4)))
+        light = sun_and_sky(
+            rng.uniform(1.5, 10.0),
+            np.array([0.0, np.sin(elevation), np.cos(elevation)]),
+            sun_scale=rng.choice([0.0, 0.1, 1.0], p=[0.2, 0.3, 0.5]),
+        )
+    return turned(light, rng.random())
+
+
+def turned(light: EnvironmentMap, share: float) -> EnvironmentMap:
+    """The map turned about the vertical by a share of a whole turn."""
+    columns = round(share * light.radiance.shape[1])
+    return EnvironmentMap(np.roll(light.radiance, columns, axis=1))
+
+
+def pixel_directions(height: int) -> Float[np.ndarray, "H W 3"]:
+    """Directions of the pixel centres of a map that is twice as wide as high."""
+    theta = (np.arange(height) + 0.5) / height * np.pi
+    phi = (np.arange(2 * height) + 0.5) / height * np.pi
+    down, around = np.meshgrid(theta, phi, indexing="ij")
+    return np.stack(
+        [
+            np.sin(around) * np.sin(down),
+            np.cos(down),
+            -np.cos(around) * np.sin(down),
+        ],
+        axis=-1,
+    )
+
+
+def irradiance_of(
+    light: EnvironmentMap, normal: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3"]:
+    """Irradiance of an unshadowed surface, by the sum over all pixels."""
+    height, width = light.radiance.shape[:2]
+    if width != 2 * height:
+        raise InputError(f"an environment map is twice as wide as high, not {width}")
+    cosine = np.maximum(pixel_directions(height) @ normal, 0.0)
+    edges = np.cos(np.linspace(0, np.pi, height + 1))
+    solid = (edges[:-1] - edges[1:])[:, None] * (2 * np.pi / width)
+    return np.sum(light.radiance * (cosine * solid)[..., None], axis=(0, 1))
