@@ -20,7 +20,7 @@ import numpy as np
 
 from benchmarks.straightforward import shade_plainly
 from benchmarks.timing import Timing, describe, load, measure
-from ginn_jax import image, reference, report, scenes
+from ginn_jax import image, objects, reference, report, scenes
 from ginn_jax.architecture import Network, compact_network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
@@ -68,10 +68,10 @@ QUICK |= {"repeats": 2}
 
 def make_frame(options: Options) -> tuple[Scene, GBuffer]:
     """An object on its ground plane, and what a camera sees of it."""
-    source = scenes.procedural_sources(1, UNSEEN_SEED)[0]
+    source = objects.procedural_sources(1, UNSEEN_SEED)[0]
     if options.mesh is not None:
-        source = scenes.file_sources(find_meshes(options.mesh))[0]
-    scene = reference.build_scene(scenes.load_object(source))
+        source = objects.file_sources(find_meshes(options.mesh))[0]
+    scene = reference.build_scene(objects.load_object(source))
     size = options.resolution
     return scene, reference.render_gbuffer(
         scene, orbit_camera(35.0, width=size, height=size)

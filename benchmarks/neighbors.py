@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.peers import PEERS, Pairs, Search
 from benchmarks.timing import Timing, describe, load, measure
-from ginn_jax import report, scenes
+from ginn_jax import objects, report
 from ginn_jax.commandline import require, start
 from ginn_jax.errors import InputError
 from ginn_jax.mesh import sample_surface
@@ -75,7 +75,7 @@ def clusters(rng: np.random.Generator, count: int) -> np.ndarray:
 
 def surface(rng: np.random.Generator, count: int) -> np.ndarray:
     """Uniform on a procedural object and its ground: what the network sees."""
-    mesh = scenes.load_object(scenes.procedural_sources(1, 0)[0])
+    mesh = objects.load_object(objects.procedural_sources(1, 0)[0])
     seed = int(rng.integers(1 << 31))
     return sample_surface(mesh, count, seed=seed).position.astype(np.float64)
 

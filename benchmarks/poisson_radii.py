@@ -20,7 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.timing import describe, load, measure
-from ginn_jax import architecture, report, scenes
+from ginn_jax import architecture, objects, report, scenes
 from ginn_jax.architecture import Network
 from ginn_jax.checkpoint import load_weights
 from ginn_jax.commandline import require, start
@@ -129,9 +129,9 @@ def load_model(folder: Path | None) -> Model:
     return Model(config.network, variables, record["occlusion"]["radius"])
 
 
-def make_subject(source: scenes.Source, options: Options, radius: float) -> Subject:
+def make_subject(source: objects.Source, options: Options, radius: float) -> Subject:
     """Sample and ray-trace an object; the points asked are others than those given."""
-    mesh = scenes.load_object(source)
+    mesh = objects.load_object(source)
     given = scenes.visible_samples(build_scene(mesh), options.points, source.seed)
     settings = scenes.Occlusion(ASKED, options.rays, radius)
     asked = scenes.occlusion_cloud(mesh, settings, source.seed + 1)
@@ -239,9 +239,9 @@ def main(options: Options) -> dict[str, Any]:
     model = model._replace(variables=variables, occlusion=occlusion)
     for radius in options.radii:
         with_disk_radius(model.network, radius)  # for its checks
-    sources = scenes.procedural_sources(options.shapes, UNSEEN_SEED)
+    sources = objects.procedural_sources(options.shapes, UNSEEN_SEED)
     if options.meshes is not None:
-        sources = scenes.file_sources(find_meshes(options.meshes))
+        sources = objects.file_sources(find_meshes(options.meshes))
     subjects = (make_subject(s, options, model.occlusion) for s in sources)
     rows = [row for subject in subjects for row in compare(model, subject, options)]
     metrics = {

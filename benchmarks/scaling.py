@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.f2d import UNSEEN_SEED, block_memory
 from benchmarks.timing import Timing, describe, load, measure
-from ginn_jax import image, reference, report, scenes
+from ginn_jax import image, objects, reference, report, scenes
 from ginn_jax.architecture import Network, compact_network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
@@ -117,7 +117,7 @@ def main(options: Options) -> dict[str, Any]:
     require(options, {"repeats": 1})
     begin = time.perf_counter()
     scene = reference.build_scene(
-        scenes.load_object(scenes.procedural_sources(1, UNSEEN_SEED)[0])
+        objects.load_object(objects.procedural_sources(1, UNSEEN_SEED)[0])
     )
     tables = {
         "points": over_points(options, scene),

@@ -21,9 +21,9 @@ from jaxtyping import Array, Key
 from matplotlib.figure import Figure
 
 from benchmarks.timing import Timing, describe, load, measure
-from ginn_jax import architecture, fit, report, scenes
+from ginn_jax import architecture, fit, objects, report, scenes
 from ginn_jax.commandline import require, start
-from ginn_jax.dataset import ShadedPoints, stack_clouds
+from ginn_jax.dataset import ShadedPoints
 from ginn_jax.errors import InputError
 from ginn_jax.geometry import Limits
 from ginn_jax.network import Variables
@@ -163,12 +163,11 @@ def profile(
 def make_batch(options: Options, config: Training) -> tuple[ShadedPoints, Limits]:
     """Procedural clouds, as training has them, and the limits it would measure."""
     settings = scenes.Occlusion(points=options.points * 5 // 4, rays=16)
-    sources = scenes.procedural_sources(options.shapes, 0)
+    sources = objects.procedural_sources(options.shapes, 0)
     folder, workers = options.out / "data", min(available_cores(), options.shapes)
     list(scenes.make_clouds(sources, settings, folder, workers))
     clouds = scenes.read_clouds(sources, settings, folder)
-    batch = stack_clouds([clouds[i % len(clouds)] for i in range(config.batch_size)])
-    return batch, fit.training_limits(config, clouds)
+    return fit.step_batch(config, clouds, 0), fit.training_limits(config, clouds)
 
 
 def main(options: Options) -> dict[str, Any]:

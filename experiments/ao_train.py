@@ -7,28 +7,21 @@ shapes that training never saw. `--help` lists every option with its default.
 """
 
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import jax
 import numpy as np
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeRemainingColumn,
-)
 
-from ginn_jax import architecture, evaluate, fit, report, scenes
+from ginn_jax import architecture, evaluate, fit, objects, report, scenes
 from ginn_jax.commandline import require, start
 from ginn_jax.errors import InputError
+from ginn_jax.experiment import Clock, closing, make, train
 from ginn_jax.geometry import Limits
 from ginn_jax.image import limits_at, with_disk_radius
 from ginn_jax.mesh import find_meshes
-from ginn_jax.process import available_cores
 from ginn_jax.train import Training
 
 UNSEEN_SEED = 10_000_000
@@ -79,18 +72,6 @@ class Options:
     """A run of about a minute on little data: to try things, not for numbers."""
 
 
-@dataclass
-class Clock:
-    """Wall seconds of the parts of a run."""
-
-    start: float = field(default_factory=time.perf_counter)
-    parts: dict[str, float] = field(default_factory=dict)
-
-    def lap(self, name: str, since: float) -> None:
-        """Add the time since `since` to a part."""
-        self.parts[name] = self.parts.get(name, 0.0) + time.perf_counter() - since
-
-
 QUICK = {
     "shapes": 8,
     "test_shapes": 3,
@@ -110,44 +91,23 @@ def main(options: Options) -> dict[str, Any]:
     train_sources = training_sources(options)
     test_sources = unseen_sources(options)
     begin = time.perf_counter()
-    clouds = make(console, "training clouds", train_sources, settings, options.out)
+    folder = options.out / "data"
+    clouds = make(
+        console, "training clouds", train_sources, settings, folder / "training"
+    )
     exact = scenes.Occlusion(options.points, VALIDATION_RAYS, options.radius)
-    unseen = make(console, "unseen clouds", test_sources, exact, options.out)
+    unseen = make(console, "unseen clouds", test_sources, exact, folder / "unseen")
     clock.lap("data", begin)
 
     config = training(options, len(clouds))
     extra = {"occlusion": asdict(settings), "objects": [s.name for s in train_sources]}
-    with bar(console) as progress:
-        task = progress.add_task("training", total=config.steps, note="compiling")
-
-        def tell(step: int, loss: float, note: str) -> None:
-            rate = step / max(time.perf_counter() - begin, 1e-9)
-            text = note or f"loss {loss:.5f}, {rate:.1f} steps/s"
-            progress.update(task, completed=step, note=text)
-            if not console.is_terminal and (note or step % 100 == 0):
-                console.print(f"step {step} of {config.steps}: {text}")
-
-        begin = time.perf_counter()
-        run = fit.fit(
-            config, clouds, options.out, fit.Schedule(), tell, options.resume, extra
-        )
+    run = train(console, config, clouds, options.out, options.resume, extra)
     clock.parts |= run.seconds
 
     begin = time.perf_counter()
     metrics = evaluation(options, run, config, unseen, test_sources, clouds)
     clock.lap("evaluation", begin)
-    metrics |= {f"seconds_{name}": seconds for name, seconds in clock.parts.items()}
-    metrics |= {
-        "seconds_total": time.perf_counter() - clock.start,
-        "peak_memory_gib": report.peak_memory_gib(),
-        "steps": int(run.state.step),
-        "skipped_steps": int(run.state.skipped),
-        "limits": dict(run.limits.sizes),
-        "limits_raised": run.raised,
-        "options": {k: str(v) for k, v in asdict(options).items()},
-        "training": asdict(config),
-        "environment": report.environment(),
-    }
+    metrics |= closing(options, run, config, clock)
     report.write_results(options.out, metrics, write_report(metrics))
     console.print(
         f"relative 3D MSE {metrics['relative_mse_3d']:.2%} on unseen shapes, "
@@ -171,48 +131,22 @@ def check(options: Options) -> None:
             raise InputError(f"--{name.replace('_', '-')} is {value}: give it above 0")
 
 
-def training_sources(options: Options) -> list[scenes.Source]:
+def training_sources(options: Options) -> list[objects.Source]:
     """Procedural shapes and the user's meshes."""
-    sources = scenes.procedural_sources(options.shapes, options.seed * 100_000)
+    sources = objects.procedural_sources(options.shapes, options.seed * 100_000)
     if options.meshes is not None:
-        sources += scenes.file_sources(find_meshes(options.meshes))
+        sources += objects.file_sources(find_meshes(options.meshes))
     return sources
 
 
-def unseen_sources(options: Options) -> list[scenes.Source]:
+def unseen_sources(options: Options) -> list[objects.Source]:
     """Procedural shapes of other seeds, and the user's test meshes."""
-    sources = scenes.procedural_sources(options.test_shapes, UNSEEN_SEED + options.seed)
-    if options.test_meshes is not None:
-        sources += scenes.file_sources(find_meshes(options.test_meshes))
-    return sources
-
-
-def make(
-    console: Console,
-    what: str,
-    sources: list[scenes.Source],
-    settings: scenes.Occlusion,
-    out: Path,
-) -> list[scenes.ShadedPoints]:
-    """Make, or find, the clouds of all sources."""
-    folder = out / "data" / f"{what.split()[0]}_{settings.rays}"
-    workers = min(available_cores(), 8)
-    with bar(console) as progress:
-        task = progress.add_task(what, total=len(sources), note="")
-        for _ in scenes.make_clouds(sources, settings, folder, workers):
-            progress.advance(task)
-    return scenes.read_clouds(sources, settings, folder)
-
-
-def bar(console: Console) -> Progress:
-    """A progress bar with time left."""
-    columns = (MofNCompleteColumn(), TimeRemainingColumn())
-    text = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.fields[note]}"),
+    sources = objects.procedural_sources(
+        options.test_shapes, UNSEEN_SEED + options.seed
     )
-    return Progress(*text, *columns, console=console, disable=not console.is_terminal)
+    if options.test_meshes is not None:
+        sources += objects.file_sources(find_meshes(options.test_meshes))
+    return sources
 
 
 def training(options: Options, clouds: int) -> Training:
@@ -235,7 +169,7 @@ def evaluation(
     run: fit.Fit,
     config: Training,
     unseen: list[scenes.ShadedPoints],
-    sources: list[scenes.Source],
+    sources: list[objects.Source],
     clouds: list[scenes.ShadedPoints],
 ) -> dict[str, Any]:
     """All errors of the trained network; draws the figures."""
@@ -267,7 +201,7 @@ def image_evaluation(
     config: Training,
     limits: Limits,
     model: evaluate.Model,
-    shown: list[tuple[scenes.Source, scenes.ShadedPoints]],
+    shown: list[tuple[objects.Source, scenes.ShadedPoints]],
 ) -> dict[str, Any]:
     """Images of unseen objects, and error against run time on the same pixels."""
     pictures, rows = [], []
@@ -279,7 +213,7 @@ def image_evaluation(
     radii = sorted({own, *others})
     views = [
         evaluate.reference_view(
-            scenes.load_object(source),
+            objects.load_object(source),
             options.radius,
             VALIDATION_RAYS,
             i,

@@ -43,6 +43,11 @@ class Network:
     oriented    whether kernels see normals beside offsets
     density     how senders are weighted, see `receptive_field`
     norm        "batch" with running moments, "layer" over channels, or "none"
+    materials   numbers of the material that a point comes with, such as its albedo
+    lights      numbers of the light that a point comes with
+    linear      whether light has features of its own on which nothing but linear maps
+                act, so that the output is exactly linear in light
+    asks        what f_2D sees of a query: its "normal", or "all" its attributes
     """
 
     levels: tuple[float, ...]
@@ -55,6 +60,10 @@ class Network:
     oriented: bool = True
     density: Literal["kde", "surface"] = "surface"
     norm: Literal["batch", "layer", "none"] = "layer"
+    materials: int = 0
+    lights: int = 0
+    linear: bool = False
+    asks: Literal["normal", "all"] = "normal"
 
 
 def released_table(k: int, radii: tuple[float, ...]) -> tuple[Conv, ...]:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from ginn_jax.errors import InputError
 from ginn_jax.receptive_field import Oriented
@@ -26,20 +26,32 @@ class ShadedPoints(NamedTuple):
     """Points with what shades them and what they are shaded to.
 
     Leading dimensions are [N] for a cloud, [B, N] for a batch, [H, W] for an image: a
-    pixel is a point. `variance` is the Monte Carlo variance of `target`.
+    pixel is a point. `variance` is the Monte Carlo variance of `target`. What an effect
+    does not need is None: `material` numbers such as albedo, and `light`, to which the
+    target is proportional; its first number sets the scale (`unit_light`).
     """
 
     position: Float[Any, "*P 3"]
     normal: Float[Any, "*P 3"]
     target: Float[Any, "*P"]
     variance: Float[Any, "*P"]
+    material: Float[Any, "*P A"] | None = None
+    light: Float[Any, "*P L"] | None = None
 
 
 def save_cloud(path: Path, cloud: ShadedPoints, origin: dict[str, Any]) -> None:
     """Write a cloud and what made it, atomically: a killed run leaves no half file."""
+    arrays = {name: a for name, a in cloud._asdict().items() if a is not None}
+    save_arrays(path, arrays, origin)
+
+
+def save_arrays(
+    path: Path, arrays: dict[str, np.ndarray], origin: dict[str, Any]
+) -> None:
+    """Write named arrays and what made them, atomically."""
     partial = path.with_suffix(f".{os.getpid()}.partial")
     with open(partial, "wb") as file:
-        np.savez(file, origin=json.dumps(origin, sort_keys=True), **cloud._asdict())
+        np.savez(file, origin=json.dumps(origin, sort_keys=True), **arrays)  # type: ignore[arg-type]
     os.replace(partial, path)
 
 
@@ -51,9 +63,19 @@ def load_cloud(path: Path, origin: dict[str, Any] | None = None) -> ShadedPoints
             `origin`.
     """
     try:
+        return ShadedPoints(**load_arrays(path, origin))
+    except TypeError:
+        raise InputError(
+            f"{path} holds another kind of cloud: choose another folder"
+        ) from None
+
+
+def load_arrays(path: Path, origin: dict[str, Any] | None) -> dict[str, np.ndarray]:
+    """Read named arrays back; `InputError` as in `load_cloud`."""
+    try:
         with np.load(path) as file:
             found = json.loads(str(file["origin"]))
-            cloud = ShadedPoints(*(file[name] for name in ShadedPoints._fields))
+            arrays = {name: file[name] for name in file.files if name != "origin"}
     except FileNotFoundError:
         raise InputError(f"{path}: no such cloud") from None
     except (OSError, ValueError, KeyError, EOFError, *_DAMAGE):
@@ -62,12 +84,30 @@ def load_cloud(path: Path, origin: dict[str, Any] | None = None) -> ShadedPoints
         ) from None
     if origin is not None and found != json.loads(json.dumps(origin)):
         raise InputError(f"{path} was made with other settings: choose another folder")
-    return cloud
+    return arrays
 
 
 def stack_clouds(clouds: Sequence[ShadedPoints]) -> ShadedPoints:
     """A batch from clouds of equal size."""
-    return ShadedPoints(*(np.stack(column) for column in zip(*clouds, strict=True)))
+    return jax.tree.map(lambda *arrays: np.stack(arrays), *clouds)
+
+
+def unit_light(
+    light: Float[Array, "N L"], mask: Bool[Array, "N"]
+) -> tuple[Float[Array, "N L"], Float[Array, ""]]:
+    """Light in units of its mean over a cloud, and that mean; zero light stays zero.
+
+    Transport is linear in light: a network that sees unit light only, and whose output
+    is scaled back, is exactly homogeneous, and a sun of 1e5 looks like any other light.
+    """
+    count = jnp.maximum(jnp.sum(mask, dtype=jnp.float32), 1.0)
+    scale = jnp.sum(jnp.where(mask, light[:, 0], 0.0)) / count
+    return light * safe_inverse(scale), scale
+
+
+def safe_inverse(scale: Float[Array, ""]) -> Float[Array, ""]:
+    """1 / scale, or 0 for 0."""
+    return jnp.where(scale > 0, 1 / jnp.where(scale > 0, scale, 1.0), 0.0)
 
 
 def rotate_about_up(cloud: ShadedPoints, *, key: Key[Array, ""]) -> ShadedPoints:

@@ -60,8 +60,7 @@ def evaluate_clouds(
     rows = []
     for name, cloud in zip(names, clouds, strict=True):
         count = len(cloud.position) * 4 // 5
-        given = ShadedPoints(*(a[:count] for a in cloud))
-        asked = ShadedPoints(*(a[count:] for a in cloud))
+        given, asked = split_cloud(cloud, count)
         encoded, limits = encode_cloud(
             network,
             limits,
@@ -88,6 +87,12 @@ def evaluate_clouds(
         )
         rows[-1]["relative_mse_3d"] = rows[-1]["mse_3d"] / rows[-1]["variance_3d"]
     return rows, limits
+
+
+def split_cloud(cloud: ShadedPoints, count: int) -> tuple[ShadedPoints, ShadedPoints]:
+    """The first `count` points and the others."""
+    first = jax.tree.map(lambda a: a[:count], cloud)
+    return first, jax.tree.map(lambda a: a[count:], cloud)
 
 
 def pool_rows(rows: Sequence[Row]) -> Row:

@@ -25,6 +25,7 @@ from ginn_jax.geometry import (
     raise_limits,
     uniform_limits,
 )
+from ginn_jax.lit_clouds import Cloud, channel_of
 from ginn_jax.train import (
     Training,
     TrainState,
@@ -62,7 +63,7 @@ Progress = Callable[[int, float, str], None]
 
 def fit(
     config: Training,
-    clouds: Sequence[ShadedPoints],
+    clouds: Sequence[Cloud],
     folder: Path,
     schedule: Schedule,
     progress: Progress,
@@ -97,7 +98,9 @@ def fit(
     while int(state.step) < config.steps:
         step = int(state.step)
         begin = time.perf_counter()
-        state, report = train_step(config, limits, state, _batch(config, clouds, step))
+        state, report = train_step(
+            config, limits, state, step_batch(config, clouds, step)
+        )
         loss = float(report.loss)
         purpose = "train" if compiled_for == limits else "compile"
         seconds[purpose] += time.perf_counter() - begin
@@ -118,7 +121,7 @@ def fit(
     return Fit(state, limits, np.array(history, np.float32), seconds, raised)
 
 
-def training_limits(config: Training, clouds: Sequence[ShadedPoints]) -> Limits:
+def training_limits(config: Training, clouds: Sequence[Cloud]) -> Limits:
     """Capacities that hold random shares of a batch, with slack."""
     share = config.batch_size // batch_mesh(config.batch_size).size
     rng = np.random.default_rng(config.seed)
@@ -127,7 +130,7 @@ def training_limits(config: Training, clouds: Sequence[ShadedPoints]) -> Limits:
     rows[:, 0] = rng.permutation(len(clouds))[:probes]
 
     def probe(limits: Limits, i: int) -> dict[str, Any]:
-        batch = stack_clouds([clouds[int(j)] for j in rows[i]])
+        batch = stack_clouds([channel_of(clouds[int(j)], 0) for j in rows[i]])
         return jax.device_get(probe_step(config, limits, batch, key=jax.random.key(i)))
 
     generous = uniform_limits(config.network, 16 * share * config.points)
@@ -149,12 +152,16 @@ def load_losses(folder: Path, steps: int) -> np.ndarray:
     return np.concatenate([found, missing])
 
 
-def _batch(config: Training, clouds: Sequence[ShadedPoints], step: int) -> ShadedPoints:
+def step_batch(config: Training, clouds: Sequence[Cloud], step: int) -> ShadedPoints:
+    """The clouds of a step, each in a random one of its colours."""
     order = batch_order(len(clouds), config.batch_size, step, seed=config.seed)
-    return stack_clouds([clouds[int(i)] for i in order])
+    channels = np.random.default_rng((config.seed, step)).integers(0, 3, len(order))
+    return stack_clouds(
+        [channel_of(clouds[i], c) for i, c in zip(order, channels, strict=True)]
+    )
 
 
-def _check(config: Training, clouds: Sequence[ShadedPoints]) -> None:
+def _check(config: Training, clouds: Sequence[Cloud]) -> None:
     if not clouds:
         raise InputError("no training clouds: ask for at least one shape")
     fewest = min(len(c.position) for c in clouds)

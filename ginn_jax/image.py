@@ -11,10 +11,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from ginn_jax.architecture import Network
+from ginn_jax.dataset import safe_inverse, unit_light
 from ginn_jax.errors import InputError
+from ginn_jax.example import points_asked, queries_asked
 from ginn_jax.geometry import (
     Demands,
     Limits,
@@ -25,7 +27,7 @@ from ginn_jax.geometry import (
     raise_limits,
 )
 from ginn_jax.neighbors import bucket, pad_rows
-from ginn_jax.network import Encoder, Shader, Variables
+from ginn_jax.network import Code, Encoder, Shader, Variables
 from ginn_jax.process import ALONE
 from ginn_jax.receptive_field import Oriented, in_coherent_order
 from ginn_jax.upsample import Surface, sample_pixels, upsample
@@ -36,12 +38,17 @@ SLACK = 1.25
 
 
 class Encoded(NamedTuple):
-    """What f_2D needs of a cloud: its finest level, searchable, with codes."""
+    """What f_2D needs of a cloud: its finest level, searchable, with codes.
+
+    Where there is light, `code` has a leading axis of channels and `scale` is the mean
+    light of each channel; else `scale` is None.
+    """
 
     points: Oriented
     grid: VoxelGrid
     area: Array | None
-    codes: Float[Array, "N K"]
+    code: Code
+    scale: Float[Array, "C"] | None
 
 
 def encode(
@@ -49,16 +56,28 @@ def encode(
     limits: Limits,
     variables: Variables,
     cloud: Oriented,
+    material: Float[Array, "C N A"] | None,
+    light: Float[Array, "C N L"] | None,
     key: Key[Array, ""],
 ) -> tuple[Encoded, Demands]:
-    """f_3D with all its geometry."""
-    cloud, _ = in_coherent_order(cloud)
+    """f_3D with all its geometry, which the channels share."""
+    mask = cloud.mask
+    cloud, order = in_coherent_order(cloud)
     geometry, demands = build_geometry(network, limits, cloud, key=key)
-    codes: Any = Encoder(network, train=False).apply(
-        variables["encoder"], geometry.levels[0].normal, geometry
-    )
-    encoded = Encoded(geometry.levels[0], geometry.grid, geometry.area, codes)
-    return encoded, demands
+    finest = geometry.levels[0]
+    rows = order[geometry.finest]
+
+    def channel(material: Array | None, light: Array | None) -> tuple[Code, Any]:
+        scale = None
+        if light is not None:
+            light, scale = unit_light(light, mask)
+        given = points_asked(finest, *_take((material, light), rows, finest.mask))
+        encoder = Encoder(network, train=False)
+        code: Any = encoder.apply(variables["encoder"], *given, geometry)
+        return code, scale
+
+    code, scale = per_channel(channel, material, light)
+    return Encoded(finest, geometry.grid, geometry.area, code, scale), demands
 
 
 def shade(
@@ -67,16 +86,51 @@ def shade(
     variables: Variables,
     encoded: Encoded,
     queries: Oriented,
-) -> tuple[Float[Array, "M"], Demands]:
+    material: Float[Array, "C M A"] | None = None,
+    light: Float[Array, "C M L"] | None = None,
+) -> tuple[Float[Array, "*C M"], Demands]:
     """f_2D with its search, for one block of queries in any order."""
     queries, order = in_coherent_order(queries)
     field, demands = build_query_field(
         network, limits, encoded.points, encoded.grid, encoded.area, queries
     )
-    values: Any = Shader(network, train=False).apply(
-        variables["shader"], encoded.codes, queries.normal, queries.mask, field
+
+    def channel(
+        code: Code, scale: Array | None, material: Array | None, light: Array | None
+    ) -> Float[Array, "M"]:
+        if light is not None and scale is not None:
+            light = light * safe_inverse(scale)
+        numbers = _take((material, light), order, queries.mask)
+        asked = queries_asked(network, queries, *numbers)
+        shader = Shader(network, train=False)
+        values: Any = shader.apply(
+            variables["shader"], code, *asked, queries.mask, field
+        )
+        values = jnp.zeros_like(values).at[order].set(values)
+        return values if scale is None else values * scale
+
+    if network.asks == "normal":
+        material = light = None
+    return per_channel(channel, encoded.code, encoded.scale, material, light), demands
+
+
+def per_channel(function: Any, *arrays: Any) -> Any:
+    """`function` for every channel; geometry and kernels are computed once.
+
+    Without light (the second argument is None) there is one channel and no axis of it.
+    """
+    return function(*arrays) if arrays[1] is None else jax.vmap(function)(*arrays)
+
+
+def _take(
+    columns: tuple[Array | None, Array | None],
+    rows: Int[Array, "M"],
+    mask: Bool[Array, "M"],
+) -> tuple[Array | None, ...]:
+    """Rows of what there is, zero where masked."""
+    return tuple(
+        None if a is None else jnp.where(mask[:, None], a[rows], 0.0) for a in columns
     )
-    return jnp.zeros_like(values).at[order].set(values), demands
 
 
 _encode = jax.jit(encode, static_argnums=(0, 1))
@@ -90,6 +144,8 @@ def encode_cloud(
     variables: Variables,
     position: Float[np.ndarray, "N 3"],
     normal: Float[np.ndarray, "N 3"],
+    material: Float[np.ndarray, "C N A"] | None = None,
+    light: Float[np.ndarray, "C N L"] | None = None,
     *,
     key: Key[Array, ""],
 ) -> tuple[Encoded, Limits]:
@@ -106,13 +162,24 @@ def encode_cloud(
     padded, mask = pad_rows(np.asarray(position, np.float32), rows)
     turned, _ = pad_rows(np.asarray(normal, np.float32), rows)
     cloud = Oriented(padded, turned, mask)
+    more = _pad_channels(material, rows), _pad_channels(light, rows)
     while True:
         deep = _without(limits, network.query.name)
-        encoded, demands = _encode(network, deep, variables, cloud, key)
+        encoded, demands = _encode(network, deep, variables, cloud, *more, key)
         short = exceeded(limits, demands)
         if not short:
             return encoded, limits
         limits = raise_limits(limits, short, SLACK)
+
+
+def _pad_channels(
+    numbers: Float[np.ndarray, "C N A"] | None, rows: int
+) -> Float[np.ndarray, "C R A"] | None:
+    """Zeros for rows up to `rows`."""
+    if numbers is None:
+        return None
+    padding = ((0, 0), (0, rows - numbers.shape[1]), (0, 0))
+    return np.pad(np.asarray(numbers, np.float32), padding)
 
 
 def only(limits: Limits, conv: str) -> Limits:
@@ -132,8 +199,14 @@ def shade_points(
     encoded: Encoded,
     position: Float[np.ndarray, "M 3"],
     normal: Float[np.ndarray, "M 3"],
-) -> tuple[Float[np.ndarray, "M"], Limits]:
-    """Values at any points, in blocks over all devices; the limits that sufficed."""
+    material: Float[np.ndarray, "C M A"] | None = None,
+    light: Float[np.ndarray, "C M L"] | None = None,
+) -> tuple[Float[np.ndarray, "M *C"], Limits]:
+    """Values at any points, in blocks over all devices; the limits that sufficed.
+
+    With light they have a last axis of channels. `material` and `light` of the points
+    themselves are needed only where the network asks for all.
+    """
     copies = [jax.device_put((variables, encoded), d) for d in jax.devices()]
     size = min(BLOCK, bucket(len(position)))
     while True:
@@ -144,8 +217,12 @@ def shade_points(
             place, mask = pad_rows(np.asarray(position[block], np.float32), size)
             turned, _ = pad_rows(np.asarray(normal[block], np.float32), size)
             queries = Oriented(place, turned, mask)
+            numbers = (
+                None if a is None else _pad_channels(a[:, block], size)
+                for a in (material, light)
+            )
             arrays = copies[number % len(copies)]
-            values, demand = _shade(network, flat, *arrays, queries)
+            values, demand = _shade(network, flat, *arrays, queries, *numbers)
             parts.append(values)
             demands.append(demand)
         short: dict[str, int] = {}
@@ -153,7 +230,10 @@ def shade_points(
             for name, need in exceeded(limits, demand).items():
                 short[name] = max(need, short.get(name, 0))
         if not short:
-            values = [np.asarray(part) for part in parts] or [np.zeros(0, np.float32)]
+            if not parts:
+                channels = () if encoded.scale is None else encoded.scale.shape
+                return np.zeros((0, *channels), np.float32), limits
+            values = [np.moveaxis(np.asarray(part), -1, 0) for part in parts]
             return np.concatenate(values)[: len(position)], limits
         limits = raise_limits(limits, short, SLACK)
 
@@ -168,8 +248,10 @@ def shade_image(
     mask: Bool[np.ndarray, "H W"],
     background: float = 1.0,
     resolution_scale: float = 1.0,
-) -> tuple[Float[np.ndarray, "H W"], Limits]:
-    """An image of openness in [0, 1]; only the pixels in `mask` are computed.
+    material: Float[np.ndarray, "C H W A"] | None = None,
+    light: Float[np.ndarray, "C H W L"] | None = None,
+) -> tuple[Float[np.ndarray, "H W *C"], Limits]:
+    """An image; only the pixels in `mask` are computed. With light, one a channel.
 
     Below a `resolution_scale` of 1 fewer are: the others are interpolated inside their
     own surface, and computed where that is not possible (see `upsample`).
@@ -179,13 +261,15 @@ def shade_image(
     """
     if not 0 < resolution_scale <= 1:
         raise InputError(f"resolution scale {resolution_scale}: give it in (0, 1]")
-    values, wanted = np.full(mask.shape, background, np.float32), mask
-    surface = Surface(position, normal, mask)
+    channels = () if encoded.scale is None else encoded.scale.shape
+    values = np.full((*mask.shape, *channels), background, np.float32)
+    wanted, surface = mask, Surface(position, normal, mask)
 
     def shade(pixels: Bool[np.ndarray, "H W"], limits: Limits) -> Limits:
         ends = position[pixels], normal[pixels]
-        found, limits = shade_points(network, limits, variables, encoded, *ends)
-        values[pixels] = as_openness(found)
+        more = (None if a is None else a[:, pixels] for a in (material, light))
+        found, limits = shade_points(network, limits, variables, encoded, *ends, *more)
+        values[pixels] = within_range(encoded, found)
         return limits
 
     if resolution_scale < 1:
@@ -194,11 +278,21 @@ def shade_image(
         sampled[np.ix_(rows, columns)] = mask[np.ix_(rows, columns)]
         limits = shade(sampled, limits)
         coarse, thickness = values[np.ix_(rows, columns)], 0.2 * network.query.radius
-        between, known = _upsample(coarse, rows, columns, surface, thickness)
-        between, known = np.asarray(between), np.asarray(known) & ~sampled
-        values[known] = between[known]
-        wanted = mask & ~known & ~sampled
+        wanted = mask & ~sampled
+        for channel in np.ndindex(*channels):
+            layer = (..., *channel)
+            between, known = _upsample(coarse[layer], rows, columns, surface, thickness)
+            known = np.asarray(known) & mask & ~sampled
+            values[layer][known] = np.asarray(between)[known]
+            wanted &= ~known
     return values, shade(wanted, limits)
+
+
+def within_range(
+    encoded: Encoded, values: Float[np.ndarray, "*P"]
+) -> Float[np.ndarray, "*P"]:
+    """Output as what it can be: openness in [0, 1], or light, which is not negative."""
+    return np.clip(values, 0.0, 1.0 if encoded.scale is None else np.inf)
 
 
 def as_openness(values: Float[np.ndarray, "*P"]) -> Float[np.ndarray, "*P"]:

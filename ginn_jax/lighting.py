@@ -102,13 +102,13 @@ def sun_and_sky(
 ) -> EnvironmentMap:
     """The clear sky of Hosek and Wilkie with its sun, above ground of albedo .3.
 
-    `direction` points to the sun, y up. The map is the mean of 4 x 4 directions a
-    pixel, so that the sun, smaller than a pixel, is not missed.
+    `direction` points to the sun, y up. The map is the mean of 2 x 2 directions a
+    pixel, closer than the sun is wide, so that it is never missed.
     """
     mi, variant = use_mitsuba()
     import drjit as dr
 
-    fine = pixel_directions(4 * HEIGHT)
+    fine = pixel_directions(2 * HEIGHT)
     with mi.variant_context(variant):
         emitter = mi.load_dict(
             {

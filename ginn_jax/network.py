@@ -5,7 +5,7 @@ light; which layers there are is `architecture`'s table. 1x1 layers and norms ar
 linen's, convolutions are `mcconv`'s.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -36,6 +36,46 @@ class Norm(nn.Module):
         return nn.leaky_relu(x, SLOPE)
 
 
+class Code(NamedTuple):
+    """What a point carries: `free` features, and `light` ones, linear in the light.
+
+    Networks that are not linear have no `light`: it came in among the attributes.
+    """
+
+    free: Float[Any, "N K"]
+    light: Float[Any, "N V"] | None
+
+
+def enter(
+    config: Network, attributes: Array, light: Array | None
+) -> tuple[Array, Array | None]:
+    """Attributes and light as the network takes them."""
+    if light is None or config.linear:
+        return attributes, light
+    return jnp.concatenate([attributes, light], axis=1), None
+
+
+def join(*codes: Code) -> Code:
+    """Features side by side."""
+    free = jnp.concatenate([c.free for c in codes], axis=1)
+    beams = [c.light for c in codes if c.light is not None]
+    return Code(free, jnp.concatenate(beams, axis=1) if beams else None)
+
+
+class Gate(nn.Module):
+    """A linear map of the light whose outputs the free features scale."""
+
+    width: int
+
+    @nn.compact
+    def __call__(
+        self, free: Float[Array, "N K"], light: Float[Array, "N V"]
+    ) -> Float[Array, "N W"]:
+        ones = nn.initializers.ones_init()
+        gate = nn.Dense(self.width, bias_init=ones, name="gate")(free)
+        return gate * nn.Dense(self.width, use_bias=False, name="light")(light)
+
+
 class McConv(nn.Module):
     """One row of the table: what comes before, and the Monte Carlo convolution."""
 
@@ -45,19 +85,19 @@ class McConv(nn.Module):
 
     @nn.compact
     def __call__(
-        self,
-        x: Float[Array, "N C"],
-        mask: Bool[Array, "N"],
-        field: Field,
-        receivers: int,
-    ) -> Float[Array, "M K"]:
+        self, x: Code, mask: Bool[Array, "N"], field: Field, receivers: int
+    ) -> Code:
         conv, config = self.conv, self.config
+        free, light = x
         if conv.before in ("norm", "dense"):
-            x = Norm(config.norm, self.train)(x, mask)
+            free = Norm(config.norm, self.train)(free, mask)
         if conv.before in ("dense", "lift"):
-            x = nn.Dense(conv.channels)(x)
-            x = Norm(config.norm, self.train)(x, mask)
-        kernels = conv.channels * (x.shape[1] if conv.mixes else 1)
+            free = nn.Dense(conv.channels)(free)
+            free = Norm(config.norm, self.train)(free, mask)
+            if light is not None:
+                light = Gate(conv.channels)(free, light)
+        both = free if light is None else jnp.concatenate([free, light], axis=1)
+        kernels = conv.channels * free.shape[1] if conv.mixes else both.shape[1]
         kernel = self.param(
             "kernel",
             lambda key: init_kernel(
@@ -69,33 +109,43 @@ class McConv(nn.Module):
             ),
         )
         if conv.mixes:
-            return mc_conv_mixing(kernel, x, field, receivers, conv.channels)
-        return mc_conv(kernel, x, field, receivers)
+            given = kernel, free, field, receivers, conv.channels
+            return Code(mc_conv_mixing(*given), None)
+        found = mc_conv(kernel, both, field, receivers)
+        width = free.shape[1]
+        return Code(found[:, :width], None if light is None else found[:, width:])
 
 
 class Encoder(nn.Module):
-    """f_3D: the encoder-decoder, from attributes per point to a code per point."""
+    """f_3D: the encoder-decoder, from attributes and light to a code per point."""
 
     config: Network
     train: bool
 
     @nn.compact
     def __call__(
-        self, attributes: Float[Array, "N C"], geometry: Geometry
-    ) -> Float[Array, "N K"]:
+        self,
+        attributes: Float[Array, "N C"],
+        light: Float[Array, "N L"] | None,
+        geometry: Geometry,
+    ) -> Code:
         config, levels = self.config, geometry.levels
-        done: dict[str, Array] = {}
-        x = attributes
+        done: dict[str, Code] = {}
+        x = Code(*enter(config, attributes, light))
         for conv in config.encoder:
             layer = McConv(config, conv, self.train, name=conv.name)
             field, target = geometry.fields[conv.name], levels[conv.target]
             x = layer(x, levels[conv.source].mask, field, target.mask.shape[0])
             if conv.skip is not None:
-                x = jnp.concatenate([done[conv.skip], x], axis=1)
+                x = join(done[conv.skip], x)
             done[conv.name] = x
-        x = Norm(config.norm, self.train)(x, levels[0].mask)
-        x = nn.Dense(config.latent, name="latent")(x)
-        return Norm(config.norm, self.train)(x, levels[0].mask)
+        free = Norm(config.norm, self.train)(x.free, levels[0].mask)
+        free = nn.Dense(config.latent, name="latent")(free)
+        free = Norm(config.norm, self.train)(free, levels[0].mask)
+        return Code(free, None if x.light is None else self._dim(free, x.light))
+
+    def _dim(self, free: Array, light: Array) -> Array:
+        return Gate(self.config.latent, name="latent_light")(free, light)
 
 
 class Shader(nn.Module):
@@ -107,15 +157,22 @@ class Shader(nn.Module):
     @nn.compact
     def __call__(
         self,
-        codes: Float[Array, "N K"],
+        code: Code,
         attributes: Float[Array, "M A"],
+        light: Float[Array, "M L"] | None,
         mask: Bool[Array, "M"],
         field: Field,
     ) -> Float[Array, "M"]:
         config = self.config
         layer = McConv(config, config.query, self.train, name=config.query.name)
-        x = layer(codes, jnp.ones(codes.shape[0], bool), field, attributes.shape[0])
-        x = Norm(config.norm, self.train)(x, mask)
-        x = nn.Dense(config.head)(jnp.concatenate([x, attributes], axis=1))
-        x = Norm(config.norm, self.train)(x, mask)
-        return nn.Dense(1)(x)[:, 0]
+        senders = jnp.ones(code.free.shape[0], bool)
+        x = layer(code, senders, field, attributes.shape[0])
+        attributes, light = enter(config, attributes, light)
+        free = Norm(config.norm, self.train)(x.free, mask)
+        free = nn.Dense(config.head)(jnp.concatenate([free, attributes], axis=1))
+        free = Norm(config.norm, self.train)(free, mask)
+        if x.light is None:
+            return nn.Dense(1)(free)[:, 0]
+        beams = [x.light] if light is None else [x.light, light]
+        dimmed = Gate(config.head, name="out_light")(free, jnp.concatenate(beams, 1))
+        return jnp.sum(dimmed, axis=1)

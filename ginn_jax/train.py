@@ -17,20 +17,11 @@ from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ginn_jax.architecture import Network
-from ginn_jax.dataset import ShadedPoints, oriented, rotate_about_up, side_by_side
-from ginn_jax.geometry import (
-    Demands,
-    Geometry,
-    Limits,
-    build_geometry,
-    build_query_field,
-    fits,
-    uniform_limits,
-)
+from ginn_jax.dataset import ShadedPoints
+from ginn_jax.example import Example, thin_and_search
+from ginn_jax.geometry import Demands, Limits, fits, uniform_limits
 from ginn_jax.network import Encoder, Shader, Variables
 from ginn_jax.process import ALONE
-from ginn_jax.receptive_field import Field, Oriented
-from ginn_jax.voxels import compact, morton_order
 
 
 @dataclass(frozen=True)
@@ -73,16 +64,6 @@ class StepReport(NamedTuple):
     demands: Demands
 
 
-class Example(NamedTuple):
-    """The geometry of a batch's share and the queries that carry the loss."""
-
-    geometry: Geometry
-    attributes: Float[Array, "N C"]
-    field: Field
-    queries: Oriented
-    target: Float[Array, "M"]
-
-
 def make_optimizer(config: Training) -> optax.GradientTransformation:
     """Adam with clipped gradients and the configured schedule."""
     if config.schedule == "paper":
@@ -99,67 +80,20 @@ def make_optimizer(config: Training) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(config.clip_norm), optax.adam(rate))
 
 
-def make_example(
-    config: Training, limits: Limits, batch: ShadedPoints, *, key: Key[Array, ""]
-) -> tuple[Example, Demands]:
-    """Rotate, thin and search a batch; queries are points that thinning left over."""
-    clouds = batch.position.shape[0]
-    turn_key, window_key, disk_key = jax.random.split(key, 3)
-    window = jax.random.randint(window_key, (), 0, batch.position.shape[1])
-    batch = jax.tree.map(
-        lambda a: jnp.roll(a, -window, axis=1)[:, : config.points], batch
-    )
-    batch = jax.vmap(lambda c, k: rotate_about_up(c, key=k))(
-        batch, jax.random.split(turn_key, clouds)
-    )
-    cloud = side_by_side(batch)
-    mask = jnp.ones(cloud.target.shape, bool)
-    order = morton_order(cloud.position, mask)
-    cloud = jax.tree.map(lambda a: a[order], cloud)
-    network = config.network
-    geometry, demands = build_geometry(network, limits, oriented(cloud), key=disk_key)
-    rows, mask = _left_over(geometry, mask, clouds * config.queries)
-    queries = Oriented(cloud.position[rows], cloud.normal[rows], mask)
-    finest, grid, area = geometry.levels[0], geometry.grid, geometry.area
-    field, more = build_query_field(network, limits, finest, grid, area, queries)
-    attributes = geometry.levels[0].normal
-    return Example(
-        geometry, attributes, field, queries, cloud.target[rows]
-    ), demands | more
-
-
-def _left_over(
-    geometry: Geometry, mask: Bool[Array, "N"], queries: int
-) -> tuple[Int[Array, "M"], Bool[Array, "M"]]:
-    """Rows that are not in level 0, `queries` of them at even steps."""
-    finest = jnp.where(geometry.levels[0].mask, geometry.finest, mask.size)
-    free, _, total = compact(mask.at[finest].set(False, mode="drop"), mask.size)
-    number = jnp.arange(queries, dtype=jnp.int32)
-    step = jnp.maximum(total.astype(jnp.float32) / queries, 1.0)
-    place = ((number.astype(jnp.float32) + 0.5) * step).astype(jnp.int32)
-    return free[jnp.minimum(place, mask.size - 1)], number < total
-
-
 def infer(
-    network: Network,
-    variables: Variables,
-    geometry: Geometry,
-    attributes: Float[Array, "N C"],
-    field: Field,
-    queries: Oriented,
-    train: bool = False,
+    network: Network, variables: Variables, example: Example, train: bool = False
 ) -> tuple[Float[Array, "M"], Variables]:
     """f_2D after f_3D, and the running moments of batch norm (changed if `train`)."""
     encoder, shader = Encoder(network, train), Shader(network, train)
-    (codes, moments_3d) = encoder.apply(
-        variables["encoder"], attributes, geometry, mutable=["batch_stats"]
+    (code, moments_3d) = encoder.apply(
+        variables["encoder"], *example.given, example.geometry, mutable=["batch_stats"]
     )
     (values, moments_2d) = shader.apply(
         variables["shader"],
-        codes,
-        queries.normal,
-        queries.mask,
-        field,
+        code,
+        *example.asked,
+        example.queries.mask,
+        example.field,
         mutable=["batch_stats"],
     )
     return values, {"encoder": moments_3d, "shader": moments_2d}
@@ -170,12 +104,11 @@ def init_variables(
 ) -> Variables:
     """Initial parameters and moments; `example` gives the shapes."""
     encoder_key, shader_key = jax.random.split(key)
-    codes, encoder = Encoder(network, True).init_with_output(
-        encoder_key, example.attributes, example.geometry
+    code, encoder = Encoder(network, True).init_with_output(
+        encoder_key, *example.given, example.geometry
     )
-    queries = example.queries
     shader = Shader(network, True).init(
-        shader_key, codes, queries.normal, queries.mask, example.field
+        shader_key, code, *example.asked, example.queries.mask, example.field
     )
     return {"encoder": encoder, "shader": shader}
 
@@ -183,18 +116,14 @@ def init_variables(
 def batch_loss(
     params: Variables, moments: Variables, network: Network, example: Example
 ) -> tuple[Float[Array, ""], Variables]:
-    """Mean squared error over the queries, the paper's L2 loss."""
+    """Mean squared error over the queries, the paper's L2 loss.
+
+    Targets are in units of their cloud's mean light, so that bright clouds and suns
+    weigh no more than others; an L2 loss keeps unbiased noisy targets unbiased.
+    """
     variables = {part: params[part] | moments[part] for part in params}
     queries = example.queries
-    values, moments = infer(
-        network,
-        variables,
-        example.geometry,
-        example.attributes,
-        example.field,
-        queries,
-        train=True,
-    )
+    values, moments = infer(network, variables, example, train=True)
     squared = jnp.where(queries.mask, (values - example.target) ** 2, 0.0)
     count = jnp.sum(queries.mask, dtype=jnp.float32)
     return jnp.sum(squared) / jnp.maximum(count, 1.0), moments
@@ -273,6 +202,14 @@ def train_step(
     return TrainState(variables, optimizer, step, skipped), report
 
 
+def make_example(
+    config: Training, limits: Limits, batch: ShadedPoints, *, key: Key[Array, ""]
+) -> tuple[Example, Demands]:
+    """What a step needs of a batch's share before any parameter enters."""
+    sizes = config.points, config.queries
+    return thin_and_search(config.network, limits, batch, *sizes, key=key)
+
+
 def init_state(config: Training) -> TrainState:
     """The state before the first step."""
     zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), _example_shapes(config))
@@ -302,10 +239,13 @@ def _example_shapes(config: Training) -> Example:
     """Shapes of what a step computes from the clouds, in the smallest capacities."""
     limits = uniform_limits(config.network, 64)
     rows = (config.batch_size, config.points)
-    point, number = (
-        jax.ShapeDtypeStruct((*rows, *more), jnp.float32) for more in ((3,), ())
-    )
-    batch = ShadedPoints(*(point, point, number, number))  # type: ignore[arg-type]
+
+    def array(width: int) -> Any:
+        return jax.ShapeDtypeStruct((*rows, width), jnp.float32) if width else None
+
+    number = jax.ShapeDtypeStruct(rows, jnp.float32)
+    more = array(config.network.materials), array(config.network.lights)
+    batch = ShadedPoints(array(3), array(3), number, number, *more)  # type: ignore[arg-type]
     example = partial(make_example, config, limits, key=jax.random.key(0))
     return jax.eval_shape(example, batch)[0]
 

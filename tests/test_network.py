@@ -18,6 +18,7 @@ from ginn_jax.architecture import (
     Network,
     compact_network,
 )
+from ginn_jax.example import Asked, Example
 from ginn_jax.geometry import (
     Geometry,
     build_geometry,
@@ -86,10 +87,10 @@ def unfilled(network, attributes, query_attributes):
 
     def init(key):
         codes, encoder = Encoder(network, True).init_with_output(
-            key, jnp.zeros((rows, attributes)), geometry
+            key, jnp.zeros((rows, attributes)), None, geometry
         )
         shader = Shader(network, True).init(
-            key, codes, jnp.zeros((rows, query_attributes)), level.mask, field
+            key, codes, jnp.zeros((rows, query_attributes)), None, level.mask, field
         )
         return encoder, shader
 
@@ -223,8 +224,8 @@ def example_of(network, factor):
             network, limits, geometry.levels[0], geometry.grid, geometry.area, queries
         )
         target = jnp.sin(9 * queries.position[:, 0])
-        attributes = geometry.levels[0].normal
-        example = train.Example(geometry, attributes, field, queries, target)
+        given, asked = (Asked(p.normal, None) for p in (geometry.levels[0], queries))
+        example = Example(geometry, given, field, queries, asked, target)
         return example, demands | more, fits(limits, demands | more)
 
     def checked(cloud, queries):
@@ -250,8 +251,7 @@ def predictor(network):
 
     @jax.jit
     def predict(variables, example):
-        geometry, attributes, field, asked, _ = example
-        return train.infer(network, variables, geometry, attributes, field, asked)[0]
+        return train.infer(network, variables, example)[0]
 
     return lambda example: np.array(predict(initial(network), example))
 

@@ -3,7 +3,7 @@ import pytest
 import tiny
 import trimesh
 
-from ginn_jax import scenes
+from ginn_jax import objects, scenes
 from ginn_jax.dataset import load_cloud
 from ginn_jax.errors import InputError
 from ginn_jax.shapes import random_shape
@@ -17,7 +17,7 @@ def sources(tmp_path_factory):
     path = tmp_path_factory.mktemp("meshes") / "crate.ply"
     box = trimesh.creation.box((1.0, 4.0, 2.0))
     box.apply_translation([7, 8, 9]).export(path)
-    return scenes.file_sources([path]) + scenes.procedural_sources(1, 5)
+    return objects.file_sources([path]) + objects.procedural_sources(1, 5)
 
 
 @pytest.fixture(scope="module")
@@ -36,28 +36,28 @@ def contents(folder):
 
 def test_object_fills_its_unit_box_on_the_ground(sources):
     for source in sources:
-        mesh = scenes.load_object(source)
+        mesh = objects.load_object(source)
         thing = mesh.vertices[np.unique(mesh.faces[mesh.material == 0])]
         ground = mesh.vertices[np.unique(mesh.faces[mesh.material == 1])]
         np.testing.assert_allclose(np.ptp(thing, axis=0).max(), 1, atol=1e-5)
         np.testing.assert_allclose(ground[:, 1], thing[:, 1].min(), atol=1e-5)
         assert (ground.min(axis=0)[[0, 2]] < thing.min(axis=0)[[0, 2]]).all()
         assert (ground.max(axis=0)[[0, 2]] > thing.max(axis=0)[[0, 2]]).all()
-    crate = scenes.load_object(sources[0])
+    crate = objects.load_object(sources[0])
     sides = np.ptp(crate.vertices[np.unique(crate.faces[crate.material == 0])], axis=0)
     np.testing.assert_allclose(sides, [0.25, 1, 0.5], atol=1e-5)
 
 
 def test_sources_have_names_and_seeds_of_their_own(tmp_path):
-    shapes = scenes.procedural_sources(3, 40)
+    shapes = objects.procedural_sources(3, 40)
     assert [s.seed for s in shapes] == [40, 41, 42]
     assert len({s.name for s in shapes}) == 3
     assert all(s.path is None for s in shapes)
-    one = scenes.load_object(shapes[0])
+    one = objects.load_object(shapes[0])
     np.testing.assert_array_equal(
         one.faces[one.material == 0].shape, random_shape(40).faces.shape
     )
-    files = scenes.file_sources([tmp_path / "a.ply", tmp_path / "b.obj"])
+    files = objects.file_sources([tmp_path / "a.ply", tmp_path / "b.obj"])
     assert [s.name for s in files] == ["a", "b"]
 
 
@@ -102,7 +102,7 @@ def test_unusable_cached_cloud_is_made_again(sources, made, tmp_path, damage):
 def test_changed_mesh_file_is_another_origin(tmp_path):
     path = tmp_path / "thing.ply"
     trimesh.creation.box((1, 1, 1)).export(path)
-    [source] = scenes.file_sources([path])
+    [source] = objects.file_sources([path])
     before = scenes.cloud_origin(source, SETTINGS)
     assert scenes.cloud_origin(source, SETTINGS) == before
     trimesh.creation.box((1, 1, 2)).export(path)
@@ -118,14 +118,14 @@ def test_workers_make_the_same_and_keep_what_is_done(sources, made, tmp_path):
     before = contents(tmp_path / "new")
     broken = tmp_path / "broken.ply"
     broken.write_text("ply\nnot really")
-    more = [*sources, *scenes.file_sources([broken])]
+    more = [*sources, *objects.file_sources([broken])]
     with pytest.raises(InputError, match=r"^[^\n]*broken\.ply[^\n]*$"):
         list(scenes.make_clouds(more, SETTINGS, tmp_path / "new", 1))
     assert contents(tmp_path / "new") == before
 
 
 def test_missing_mesh_is_refused(tmp_path):
-    [source] = scenes.file_sources([tmp_path / "gone.ply"])
+    [source] = objects.file_sources([tmp_path / "gone.ply"])
     with pytest.raises(InputError, match=r"^[^\n]*gone\.ply[^\n]*$"):
         scenes.make_cloud(source, SETTINGS, tmp_path / "gone.npz")
     assert list(tmp_path.iterdir()) == []

@@ -14,7 +14,7 @@ import optax
 import pytest
 import tiny
 
-from ginn_jax import train
+from ginn_jax import example, train
 from ginn_jax.architecture import compact_network
 from ginn_jax.geometry import Geometry, exceeded, uniform_limits
 from ginn_jax.receptive_field import Oriented
@@ -238,7 +238,7 @@ def test_left_over_points_carry_the_loss():
     level = Oriented(np.zeros((5, 3), np.float32), np.zeros((5, 3), np.float32), mask)
     finest = jnp.array([0, 4, 7, 11, 11], jnp.int32)
     geometry = Geometry((level,), finest, {}, None, None)
-    left_over = jax.jit(train._left_over, static_argnums=2)
+    left_over = jax.jit(example.left_over, static_argnums=2)
     rows, real = left_over(geometry, jnp.ones(12, bool), 3)
     assert real.all()
     assert rows.tolist() == [2, 6, 10]
@@ -251,8 +251,8 @@ def test_queries_lie_beside_the_finest_level():
     config = replace(tiny.CONFIG, network=ONE_LEVEL, queries=100)
     build = partial(train.make_example, config, ONE_LEVEL_LIMITS)
     with tiny.cheap_compiling():
-        example, _ = jax.jit(build)(tiny.batch(), key=jax.random.key(3))
-    queries, level = example.queries, example.geometry.levels[0]
+        made, _ = jax.jit(build)(tiny.batch(), key=jax.random.key(3))
+    queries, level = made.queries, made.geometry.levels[0]
     assert queries.mask.sum() == 200
     turned = np.array(queries.position)[:, 0] > 2
     position = np.array(queries.position, np.float64)
@@ -263,4 +263,4 @@ def test_queries_lie_beside_the_finest_level():
     # Each still has its own target, wherever rotation and thinning have put it.
     centred = position - np.outer(turned, [4, 0, 0])
     exact = tiny.exact_openness(centred, np.array(queries.normal))
-    np.testing.assert_allclose(example.target, exact, atol=1e-4)
+    np.testing.assert_allclose(made.target, exact, atol=1e-4)

@@ -1,0 +1,132 @@
+"""What a training step computes from its clouds before any parameter enters.
+
+Clouds are turned, thinned by Poisson disk sampling and searched; the points that
+thinning leaves over are asked for their shading and carry the loss.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from ginn_jax.architecture import Network
+from ginn_jax.dataset import (
+    ShadedPoints,
+    oriented,
+    rotate_about_up,
+    safe_inverse,
+    side_by_side,
+    unit_light,
+)
+from ginn_jax.geometry import (
+    Demands,
+    Geometry,
+    Limits,
+    build_geometry,
+    build_query_field,
+)
+from ginn_jax.receptive_field import Field, Oriented
+from ginn_jax.voxels import compact, morton_order
+
+
+class Asked(NamedTuple):
+    """Points as the network takes them: attributes, and light in the cloud's unit."""
+
+    attributes: Float[Array, "N A"]
+    light: Float[Array, "N L"] | None
+
+
+class Example(NamedTuple):
+    """The geometry of a batch's share and the queries that carry the loss.
+
+    `given` are the points of level 0, `asked` the queries; `target` is in units of the
+    mean light of its cloud.
+    """
+
+    geometry: Geometry
+    given: Asked
+    field: Field
+    queries: Oriented
+    asked: Asked
+    target: Float[Array, "M"]
+
+
+def thin_and_search(
+    network: Network,
+    limits: Limits,
+    batch: ShadedPoints,
+    points: int,
+    queries: int,
+    *,
+    key: Key[Array, ""],
+) -> tuple[Example, Demands]:
+    """Turn, thin and search a batch [B, N], of whose clouds `points` are taken."""
+    clouds = batch.position.shape[0]
+    turn_key, window_key, disk_key = jax.random.split(key, 3)
+    window = jax.random.randint(window_key, (), 0, batch.position.shape[1])
+    batch = jax.tree.map(lambda a: jnp.roll(a, -window, axis=1)[:, :points], batch)
+    turn_keys = jax.random.split(turn_key, clouds)
+    batch = jax.vmap(lambda c, k: rotate_about_up(c, key=k))(batch, turn_keys)
+    cloud = side_by_side(jax.vmap(in_unit_light)(batch))
+    mask = jnp.ones(cloud.target.shape, bool)
+    order = morton_order(cloud.position, mask)
+    cloud = jax.tree.map(lambda a: a[order], cloud)
+    geometry, demands = build_geometry(network, limits, oriented(cloud), key=disk_key)
+    rows, real = left_over(geometry, mask, clouds * queries)
+    asking = Oriented(cloud.position[rows], cloud.normal[rows], real)
+    finest, grid, area = geometry.levels[0], geometry.grid, geometry.area
+    field, more = build_query_field(network, limits, finest, grid, area, asking)
+    given = points_asked(finest, *numbers(cloud, geometry.finest, finest.mask))
+    asked = queries_asked(network, asking, *numbers(cloud, rows, real))
+    example = Example(geometry, given, field, asking, asked, cloud.target[rows])
+    return example, demands | more
+
+
+def in_unit_light(cloud: ShadedPoints) -> ShadedPoints:
+    """Light and target in units of the cloud's mean light."""
+    if cloud.light is None:
+        return cloud
+    light, scale = unit_light(cloud.light, jnp.ones(cloud.target.shape, bool))
+    return cloud._replace(light=light, target=cloud.target * safe_inverse(scale))
+
+
+def numbers(
+    cloud: ShadedPoints, rows: Int[Array, "M"], mask: Bool[Array, "M"]
+) -> tuple[Array | None, Array | None]:
+    """Material and light of some rows, zero where masked."""
+
+    def take(a: Array | None) -> Array | None:
+        return None if a is None else jnp.where(mask[:, None], a[rows], 0.0)
+
+    return take(cloud.material), take(cloud.light)
+
+
+def points_asked(
+    points: Oriented, material: Array | None, light: Array | None
+) -> Asked:
+    """Points as the network takes them."""
+    if material is None:
+        return Asked(points.normal, light)
+    return Asked(jnp.concatenate([points.normal, material], axis=1), light)
+
+
+def queries_asked(
+    network: Network, queries: Oriented, material: Array | None, light: Array | None
+) -> Asked:
+    """What f_2D is told of the queries themselves."""
+    if network.asks == "normal":
+        return Asked(queries.normal, None)
+    return points_asked(queries, material, light)
+
+
+def left_over(
+    geometry: Geometry, mask: Bool[Array, "N"], queries: int
+) -> tuple[Int[Array, "M"], Bool[Array, "M"]]:
+    """Rows that are not in level 0, `queries` of them at even steps."""
+    finest = jnp.where(geometry.levels[0].mask, geometry.finest, mask.size)
+    free, _, total = compact(mask.at[finest].set(False, mode="drop"), mask.size)
+    number = jnp.arange(queries, dtype=jnp.int32)
+    step = jnp.maximum(total.astype(jnp.float32) / queries, 1.0)
+    place = ((number.astype(jnp.float32) + 0.5) * step).astype(jnp.int32)
+    return free[jnp.minimum(place, mask.size - 1)], number < total

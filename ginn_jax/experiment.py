@@ -1,0 +1,102 @@
+"""What every experiment does around its effect: data, training, records."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeRemainingColumn,
+)
+
+from ginn_jax import fit, report, scenes
+from ginn_jax.lit_clouds import Cloud
+from ginn_jax.objects import Source
+from ginn_jax.process import available_cores
+from ginn_jax.train import Training
+
+
+@dataclass
+class Clock:
+    """Wall seconds of the parts of a run."""
+
+    start: float = field(default_factory=time.perf_counter)
+    parts: dict[str, float] = field(default_factory=dict)
+
+    def lap(self, name: str, since: float) -> None:
+        """Add the time since `since` to a part."""
+        self.parts[name] = self.parts.get(name, 0.0) + time.perf_counter() - since
+
+
+def make(
+    console: Console,
+    what: str,
+    sources: Sequence[Source],
+    settings: scenes.Settings,
+    folder: Path,
+) -> list[Any]:
+    """Make, or find, the clouds of all sources."""
+    workers = min(available_cores(), 8)
+    with bar(console) as progress:
+        task = progress.add_task(what, total=len(sources), note="")
+        for _ in scenes.make_clouds(sources, settings, folder, workers):
+            progress.advance(task)
+    return scenes.read_clouds(sources, settings, folder)
+
+
+def bar(console: Console) -> Progress:
+    """A progress bar with time left."""
+    columns = (MofNCompleteColumn(), TimeRemainingColumn())
+    text = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    return Progress(*text, *columns, console=console, disable=not console.is_terminal)
+
+
+def train(
+    console: Console,
+    config: Training,
+    clouds: Sequence[Cloud],
+    out: Path,
+    resume: bool,
+    extra: dict[str, Any],
+) -> fit.Fit:
+    """`fit.fit` with a progress bar, or a line every 100 steps where none can be."""
+    begin = time.perf_counter()
+    with bar(console) as progress:
+        task = progress.add_task("training", total=config.steps, note="compiling")
+
+        def tell(step: int, loss: float, note: str) -> None:
+            rate = step / max(time.perf_counter() - begin, 1e-9)
+            text = note or f"loss {loss:.5f}, {rate:.1f} steps/s"
+            progress.update(task, completed=step, note=text)
+            if not console.is_terminal and (note or step % 100 == 0):
+                console.print(f"step {step} of {config.steps}: {text}")
+
+        return fit.fit(config, clouds, out, fit.Schedule(), tell, resume, extra)
+
+
+def closing(
+    options: Any, run: fit.Fit, config: Training, clock: Clock
+) -> dict[str, Any]:
+    """What metrics.json says of every run, whatever its effect."""
+    seconds = {f"seconds_{name}": spent for name, spent in clock.parts.items()}
+    return seconds | {
+        "seconds_total": time.perf_counter() - clock.start,
+        "peak_memory_gib": report.peak_memory_gib(),
+        "steps": int(run.state.step),
+        "skipped_steps": int(run.state.skipped),
+        "limits": dict(run.limits.sizes),
+        "limits_raised": run.raised,
+        "options": {k: str(v) for k, v in asdict(options).items()},
+        "training": asdict(config),
+        "environment": report.environment(),
+    }

@@ -1,0 +1,165 @@
+"""Where objects and lights come from: seeds and files, and which belong together."""
+
+import warnings
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ginn_jax.errors import InputError, InputWarning
+from ginn_jax.lighting import (
+    Light,
+    PointLight,
+    load_environment,
+    procedural_environment,
+    turned,
+)
+from ginn_jax.mesh import Mesh, add_ground, fit_unit_box, load_mesh
+from ginn_jax.shapes import random_shape
+
+
+@dataclass(frozen=True)
+class LightSource:
+    """One light: a file, or the seed of a procedural environment or point light."""
+
+    name: str
+    path: str | None
+    seed: int
+    point: bool = False
+
+
+@dataclass(frozen=True)
+class Source:
+    """One object: a mesh file, or the seed of a procedural shape; and its light."""
+
+    name: str
+    path: str | None
+    seed: int
+    light: LightSource | None = None
+
+
+def procedural_sources(count: int, first_seed: int) -> list[Source]:
+    """Procedural shapes of consecutive seeds."""
+    return [
+        Source(f"shape_{s}", None, s) for s in range(first_seed, first_seed + count)
+    ]
+
+
+def file_sources(paths: Sequence[Path]) -> list[Source]:
+    """The objects of mesh files, each under a name of its own.
+
+    That is the file's name, or as much of its path as tells it from the others: all
+    models of ShapeNetCore are called model_normalized.obj.
+    """
+    return [
+        Source(name, str(path), i)
+        for i, (name, path) in enumerate(zip(tell_apart(paths), paths, strict=True))
+    ]
+
+
+def tell_apart(paths: Sequence[Path]) -> list[str]:
+    """The shortest ends of the paths, of one length, that are all different."""
+    parts = [[*path.parent.parts[1:], path.stem] for path in paths]
+    for length in range(1, max((len(p) for p in parts), default=1) + 1):
+        names = ["_".join(p[-length:]) for p in parts]
+        if len(set(names)) == len(names):
+            return names
+    return [f"{i}_{p[-1]}" for i, p in enumerate(parts)]
+
+
+def procedural_lights(count: int, first_seed: int) -> list[LightSource]:
+    """Procedural environments of consecutive seeds."""
+    return [
+        LightSource(f"sky_{s}", None, s) for s in range(first_seed, first_seed + count)
+    ]
+
+
+def point_lights(count: int, first_seed: int) -> list[LightSource]:
+    """Point lights of consecutive seeds."""
+    return [
+        LightSource(f"point_{s}", None, s, point=True)
+        for s in range(first_seed, first_seed + count)
+    ]
+
+
+def file_lights(paths: Sequence[Path]) -> list[LightSource]:
+    """The environment maps of files, each under a name of its own."""
+    return [
+        LightSource(name, str(path), i)
+        for i, (name, path) in enumerate(zip(tell_apart(paths), paths, strict=True))
+    ]
+
+
+def pair_up(
+    objects: Sequence[Source], lights: Sequence[LightSource], each: int
+) -> list[Source]:
+    """Every object under `each` of the lights, in turns, so that all are used."""
+    if not lights:
+        raise InputError("no lights: give environment maps, or ask for procedural ones")
+    each = min(each, len(lights))
+    pairs = []
+    for i, source in enumerate(objects):
+        for k in range(each):
+            light = lights[(i * each + k) % len(lights)]
+            seed = (source.seed if source.path is None else i) * each + k
+            name = f"{source.name}__{light.name}"
+            pairs.append(replace(source, name=name, light=light, seed=seed))
+    return pairs
+
+
+def load_object(source: Source, ground: bool = True) -> Mesh:
+    """The object in its unit box, on the ground if there is one."""
+    if source.path is None:
+        mesh = random_shape(shape_seed(source))
+    else:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", InputWarning)
+            mesh = load_mesh(source.path)
+    mesh = fit_unit_box(mesh)
+    return add_ground(mesh) if ground else mesh
+
+
+def shape_seed(source: Source) -> int:
+    """The seed of a procedural shape, which its name keeps under any light."""
+    return int(source.name.split("__")[0].removeprefix("shape_"))
+
+
+def load_light(source: Source) -> Light:
+    """The light of a source; one from a file is turned at random by the seed."""
+    light = source.light
+    if light is None:
+        raise InputError(f"{source.name}: no light; pair the object with one")
+    if light.point:
+        return random_point_light(light.seed)
+    if light.path is None:
+        return procedural_environment(light.seed)
+    share = np.random.default_rng((source.seed, 2)).random()
+    return turned(load_environment(light.path), share)
+
+
+def random_point_light(seed: int) -> PointLight:
+    """A white light above and beside the object, out of its unit box."""
+    rng = np.random.default_rng((seed, 3))
+    around, up = rng.uniform(0, 2 * np.pi), rng.uniform(0.6, 1.4)
+    away = rng.uniform(0.9, 1.6)
+    place = away * np.cos(around), up, away * np.sin(around)
+    return PointLight(np.array(place), np.full(3, 5.0))
+
+
+def origin_of(source: Source) -> dict[str, Any]:
+    """What a source is, files by the checksum of their contents."""
+    found: dict[str, Any] = {"seed": source.seed}
+    found["object"] = _contents(source.path) if source.path else source.name
+    if light := source.light:
+        found["light"] = _contents(light.path) if light.path else light.name
+    return found
+
+
+def _contents(path: str) -> int:
+    try:
+        return zlib.crc32(Path(path).read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}") from None
