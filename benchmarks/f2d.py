@@ -20,7 +20,7 @@ import numpy as np
 
 from benchmarks.straightforward import shade_plainly
 from benchmarks.timing import Timing, describe, load, measure
-from ginn_jax import image, objects, reference, report, scenes
+from ginn_jax import image, lit_scenes, objects, reference, report
 from ginn_jax.architecture import Network, compact_network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
@@ -107,7 +107,7 @@ def compare(
     )
     state = init_state(Training(network, steps=1))
     variables = jax.device_put(state.variables, jax.devices()[0])
-    cloud = scenes.visible_samples(scene, 20_000, seed=0)
+    cloud = lit_scenes.visible_samples(scene, 20_000, seed=0)
     key = jax.random.key(0)
     limits = uniform_limits(network, 1 << 17)
     encoded, limits = image.encode_cloud(

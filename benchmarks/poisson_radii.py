@@ -20,7 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.timing import describe, load, measure
-from ginn_jax import architecture, objects, report, scenes
+from ginn_jax import architecture, lit_scenes, objects, report, scenes
 from ginn_jax.architecture import Network
 from ginn_jax.checkpoint import load_weights
 from ginn_jax.commandline import require, start
@@ -132,7 +132,7 @@ def load_model(folder: Path | None) -> Model:
 def make_subject(source: objects.Source, options: Options, radius: float) -> Subject:
     """Sample and ray-trace an object; the points asked are others than those given."""
     mesh = objects.load_object(source)
-    given = scenes.visible_samples(build_scene(mesh), options.points, source.seed)
+    given = lit_scenes.visible_samples(build_scene(mesh), options.points, source.seed)
     settings = scenes.Occlusion(ASKED, options.rays, radius)
     asked = scenes.occlusion_cloud(mesh, settings, source.seed + 1)
     view = reference_view(mesh, radius, options.rays, source.seed, options.resolution)

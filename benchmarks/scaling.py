@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.f2d import UNSEEN_SEED, block_memory
 from benchmarks.timing import Timing, describe, load, measure
-from ginn_jax import image, objects, reference, report, scenes
+from ginn_jax import image, lit_scenes, objects, reference, report
 from ginn_jax.architecture import Network, compact_network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
@@ -83,7 +83,7 @@ def over_pixels(options: Options, scene: reference.Scene) -> list[dict[str, Any]
     """f_2D, for frames of each size; its scratch memory is that of a block."""
     network = network_for(16_000)
     variables = weights_of(network)
-    cloud = scenes.visible_samples(scene, 16_000, seed=0)
+    cloud = lit_scenes.visible_samples(scene, 16_000, seed=0)
     limits = uniform_limits(network, 1 << 17)
     encoded, limits = image.encode_cloud(
         network,

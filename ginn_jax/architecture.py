@@ -156,3 +156,13 @@ def compact_network(
 
 DEFAULT = compact_network()
 PRESETS = {"default": DEFAULT, "paper": PAPER, "released": RELEASED}
+
+# Light: the albedo of a point and what it sends out; or albedo, extinction and index
+# of refraction, and the irradiance.
+LIT = {
+    "linear": compact_network(k=16, lights=1, linear=True),
+    "homogeneous": compact_network(lights=1),
+    "released": replace(RELEASED, lights=1),
+}
+ILLUMINATION = {name: replace(n, materials=1) for name, n in LIT.items()}
+SCATTERING = {name: replace(n, materials=3, asks="all") for name, n in LIT.items()}

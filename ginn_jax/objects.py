@@ -4,8 +4,9 @@ import warnings
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from ginn_jax.lighting import (
 )
 from ginn_jax.mesh import Mesh, add_ground, fit_unit_box, load_mesh
 from ginn_jax.shapes import random_shape
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,39 @@ class Source:
     path: str | None
     seed: int
     light: LightSource | None = None
+
+
+@dataclass(frozen=True)
+class Split:
+    """How many objects, each under how many lights, to train, validate and test on.
+
+    No object and no light is in two of the three.
+    """
+
+    train: tuple[int, int]
+    validation: tuple[int, int]
+    test: tuple[int, int]
+    points: int
+    paths: int
+
+
+# Section "Training Data Generation" of the paper: sizes, points and rays of GI and SSS.
+PAPER_SPLIT = Split((1000, 20), (200, 5), (500, 5), 20_000, 4096)
+
+
+def split_apart(items: Sequence[T], counts: Sequence[int], seed: int) -> list[list[T]]:
+    """Disjoint random parts of a list, of so many items each.
+
+    Raises `InputError` where there are too few.
+    """
+    if len(items) < sum(counts):
+        raise InputError(
+            f"a split into {', '.join(map(str, counts))} needs {sum(counts)} objects "
+            f"or lights, there are {len(items)}: give more"
+        )
+    order = np.random.default_rng((seed, 6)).permutation(len(items))
+    stops = np.cumsum([0, *counts])
+    return [[items[i] for i in sorted(order[a:b])] for a, b in pairwise(stops)]
 
 
 def procedural_sources(count: int, first_seed: int) -> list[Source]:

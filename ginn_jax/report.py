@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from ginn_jax.metrics import tone_map
 from ginn_jax.process import available_cores
 
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "mitsuba", "trimesh")
@@ -115,6 +116,24 @@ def draw_views(path: Path, views: Sequence[tuple[str, np.ndarray, np.ndarray]]) 
             axes.set_title(name, fontsize=8)
             axes.axis("off")
     figure.savefig(path, dpi=165)
+
+
+def draw_color_views(
+    path: Path,
+    views: Sequence[tuple[str, Sequence[np.ndarray]]],
+) -> None:
+    """Rows of a title and four panels: reference, prediction, transport of both."""
+    figure = Figure(figsize=(12.4, 3.1 * len(views)), layout="constrained")
+    grid = np.atleast_2d(figure.subplots(len(views), 4, squeeze=False))
+    names = ("reference", "network", "transported light alone", "network, alone")
+    for row, (title, panels) in zip(grid, views, strict=True):
+        for number, (axes, panel) in enumerate(zip(row, panels, strict=True)):
+            reference = panels[number // 2 * 2]
+            axes.imshow(tone_map(panel, reference, reference.sum(-1) > 0))
+            axes.set_title(f"{title}: {names[number]}" if not number else names[number])
+            axes.title.set_fontsize(8)
+            axes.axis("off")
+    figure.savefig(path, dpi=120)
 
 
 def draw_error_against_time(

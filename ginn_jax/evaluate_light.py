@@ -1,0 +1,232 @@
+"""Errors of networks that carry light: at points, in images, against run time.
+
+All errors are in units of the squared mean light of the cloud and channel (see
+`dataset.unit_light`), so that a bright light weighs no more than a dim one, and pooled
+over channels and clouds as a ratio of means.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ginn_jax.architecture import Network
+from ginn_jax.camera import orbit_camera
+from ginn_jax.evaluate import Model, Row, timed
+from ginn_jax.geometry import Limits
+from ginn_jax.image import Encoded, encode_cloud, shade_image, shade_points
+from ginn_jax.irradiance import direct_irradiance
+from ginn_jax.lit_clouds import LitCloud, network_numbers, split_points
+from ginn_jax.lit_scenes import Illumination, Lit, Scattering, light_up, transport
+from ginn_jax.metrics import dssim, equal_rays, tone_map
+from ginn_jax.objects import Source
+from ginn_jax.reference import GBuffer, build_scene, render_gbuffer
+
+
+class LitView(NamedTuple):
+    """One lit object seen by one camera; its foreground pixels are a cloud."""
+
+    lit: Lit
+    gbuffer: GBuffer
+    pixels: LitCloud
+
+
+def encode_lit(
+    network: Network, limits: Limits, model: Model, cloud: LitCloud
+) -> tuple[Encoded, Limits]:
+    """f_3D of a cloud; all channels, or one where the light is grey."""
+    numbers = distinct_channels(*network_numbers(cloud))
+    ends = model.variables, cloud.position, cloud.normal
+    return encode_cloud(network, limits, *ends, *numbers, key=model.key)
+
+
+def distinct_channels(
+    material: Float[np.ndarray, "3 N A"], light: Float[np.ndarray, "3 N L"]
+) -> tuple[Float[np.ndarray, "C N A"], Float[np.ndarray, "C N L"]]:
+    """One channel where all three are the same, as under grey light on grey things."""
+    same = all(np.array_equal(a[0], a[k]) for a in (material, light) for k in (1, 2))
+    return (material[:1], light[:1]) if same else (material, light)
+
+
+def evaluate_lit_clouds(
+    network: Network,
+    limits: Limits,
+    model: Model,
+    clouds: Sequence[LitCloud],
+    names: Sequence[str],
+    settings: Illumination | Scattering,
+) -> tuple[list[Row], Limits]:
+    """3D errors of every cloud, at those points that have a target, noise subtracted.
+
+    The other points are the network's input.
+    """
+    rows = []
+    targets = settings.targets or settings.points // 5
+    for name, cloud in zip(names, clouds, strict=True):
+        given, asked = split_points(cloud, len(cloud.position) - targets)
+        encoded, limits = encode_lit(network, limits, model, given)
+        numbers = network_numbers(asked)
+        ends = model.variables, encoded, asked.position, asked.normal
+        values, limits = shade_points(network, limits, *ends, *numbers)
+        errors = unit_errors(encoded, asked, np.maximum(values, 0.0))
+        rows.append({"name": name, "points": int(np.sum(encoded.points.mask))} | errors)
+        rows[-1]["path_variance"] = rows[-1]["noise_floor_3d"] * settings.paths
+    return rows, limits
+
+
+def unit_errors(
+    encoded: Encoded, asked: LitCloud, values: Float[np.ndarray, "N C"]
+) -> Row:
+    """Errors of `values` at points, means over the channels that are lit."""
+    scale = np.asarray(encoded.scale, np.float64)
+    lit = scale > 0
+    unit = np.where(lit, scale, 1.0) ** 2
+    raw = np.mean((values.astype(np.float64) - asked.target) ** 2, axis=0) / unit
+    noise = np.mean(asked.variance, axis=0, dtype=np.float64) / unit
+    spread = np.var(asked.target, axis=0, dtype=np.float64) / unit - noise
+    lit = np.broadcast_to(lit, raw.shape)
+    errors = {
+        "mse_3d": float(np.mean((raw - noise)[lit])),
+        "noise_floor_3d": float(np.mean(noise[lit])),
+        "variance_3d": float(np.mean(spread[lit])),
+    }
+    return errors | {"relative_mse_3d": errors["mse_3d"] / errors["variance_3d"]}
+
+
+def pool_lit_rows(rows: Sequence[Row]) -> Row:
+    """Means over the clouds; relative errors are ratios of means."""
+    names = ("mse_3d", "noise_floor_3d", "variance_3d", "path_variance")
+    pooled = {name: float(np.mean([row[name] for row in rows])) for name in names}
+    relative = [row["relative_mse_3d"] for row in rows]
+    return pooled | {
+        "clouds": len(rows),
+        "relative_mse_3d": pooled["mse_3d"] / pooled["variance_3d"],
+        "median_relative_mse_3d": float(np.median(relative)),
+        "equal_rays": equal_rays(pooled["mse_3d"], pooled["path_variance"]),
+    }
+
+
+def lit_view(
+    source: Source,
+    settings: Illumination | Scattering,
+    paths: int,
+    size: int,
+    azimuth: float = 35.0,
+) -> LitView:
+    """A source with its path-traced reference at every foreground pixel."""
+    lit = light_up(source, settings)
+    camera = orbit_camera(azimuth, width=size, height=size)
+    gbuffer = render_gbuffer(build_scene(lit.scene.mesh), camera)
+    position, normal = (a[gbuffer.mask] for a in (gbuffer.position, gbuffer.normal))
+    direct = direct_irradiance(
+        lit.scene, position, normal, samples=settings.looks, seed=source.seed
+    )
+    truth = transport(lit, position, normal, paths=paths, seed=source.seed)
+    material = gbuffer.material[gbuffer.mask]
+    light = direct, truth.mean, truth.variance
+    pixels = LitCloud(position, normal, material, *light, lit.albedo, lit.medium)
+    return LitView(lit, gbuffer, pixels)
+
+
+def fill(
+    mask: Bool[np.ndarray, "H W"], values: Float[np.ndarray, "P *C"]
+) -> Float[np.ndarray, "H W *C"]:
+    """An image of the foreground values, black elsewhere."""
+    image = np.zeros((*mask.shape, *values.shape[1:]), np.float32)
+    image[mask] = values
+    return image
+
+
+def displayed(
+    view: LitView, transported: Float[np.ndarray, "P 3"]
+) -> Float[np.ndarray, "H W 3"]:
+    """Radiance of the pixels: (direct + indirect) albedo / pi, or exitance / pi."""
+    pixels = view.pixels
+    if pixels.medium.size:
+        return fill(view.gbuffer.mask, transported / np.pi)
+    albedo = pixels.albedo[pixels.material]
+    return fill(view.gbuffer.mask, (pixels.irradiance + transported) * albedo / np.pi)
+
+
+def lit_image_errors(
+    view: LitView, values: Float[np.ndarray, "P 3"], scale: Float[np.ndarray, "C"]
+) -> Row:
+    """2D errors of the foreground: of the transported light less its noise, in units of
+    the mean light; DSSIM of what is displayed, tone-mapped."""
+    mask, pixels = view.gbuffer.mask, view.pixels
+    unit = np.maximum(np.asarray(scale, np.float64), 1e-30) ** 2
+    raw = np.mean((values.astype(np.float64) - pixels.target) ** 2, axis=0)
+    noise = np.mean(pixels.variance, axis=0)
+    spread = np.var(pixels.target, axis=0) - noise
+    right = displayed(view, pixels.target)
+    mine, right = (tone_map(i, right, mask) for i in (displayed(view, values), right))
+    return {
+        "mse_2d": float(np.mean((raw - noise) / unit)),
+        "variance_2d": float(np.mean(spread / unit)),
+        "dssim_2d": dssim(mine, right, mask),
+    }
+
+
+def lit_network_row(
+    network: Network,
+    limits: Limits,
+    model: Model,
+    cloud: LitCloud,
+    view: LitView,
+    scale: float = 1.0,
+) -> tuple[Row, Float[np.ndarray, "P 3"], Encoded, Limits]:
+    """Errors and times of the network on one object; its values and codes."""
+    _, limits = encode_lit(network, limits, model, cloud)
+    (encoded, limits), _, deep = timed(
+        lambda: encode_lit(network, limits, model, cloud)
+    )
+    mask = view.gbuffer.mask
+    numbers = network_numbers(view.pixels)
+    channels = encoded.scale.shape[0] if encoded.scale is not None else 1
+    material, light = (
+        np.stack([fill(mask, a) for a in number[:channels]]) for number in numbers
+    )
+
+    def shade() -> tuple[Float[np.ndarray, "H W C"], Limits]:
+        gbuffer = view.gbuffer.position, view.gbuffer.normal, mask
+        return shade_image(
+            network,
+            limits,
+            model.variables,
+            encoded,
+            *gbuffer,
+            background=0.0,
+            resolution_scale=scale,
+            material=material,
+            light=light,
+        )
+
+    _, limits = shade()
+    (image, limits), _, flat = timed(shade)
+    values = np.broadcast_to(image[mask], view.pixels.target.shape)
+    lower = f", scale {scale:g}" if scale < 1 else ""
+    row = {
+        "method": f"network{lower}",
+        "points": int(np.sum(encoded.points.mask)),
+        "seconds_3d": deep,
+        "seconds_2d": flat,
+        "seconds": deep + flat,
+    }
+    units = np.asarray(encoded.scale)
+    return row | lit_image_errors(view, values, units), values, encoded, limits
+
+
+def path_row(
+    view: LitView, paths: int, seed: int, scale: Float[np.ndarray, "C"]
+) -> Row:
+    """Error and time of path tracing the same pixels with `paths` each."""
+    pixels = view.pixels
+    truth, _, seconds = timed(
+        lambda: transport(
+            view.lit, pixels.position, pixels.normal, paths=paths, seed=seed
+        ),
+        repeats=1,
+    )
+    row = {"method": f"{paths} paths", "paths": paths, "seconds": seconds}
+    return row | lit_image_errors(view, truth.mean, scale)

@@ -1,0 +1,359 @@
+"""What the experiments of effects that carry light share: options, run, report."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import numpy as np
+from rich.console import Console
+
+from ginn_jax import evaluate_light, fit, report
+from ginn_jax.architecture import Network
+from ginn_jax.commandline import require
+from ginn_jax.errors import InputError
+from ginn_jax.evaluate import Model, mean_rows
+from ginn_jax.experiment import Clock, closing, make, train
+from ginn_jax.lighting import find_environments
+from ginn_jax.lit_clouds import LitCloud, network_numbers
+from ginn_jax.lit_scenes import Illumination, Scattering
+from ginn_jax.mesh import find_meshes
+from ginn_jax.objects import (
+    PAPER_SPLIT,
+    LightSource,
+    Source,
+    file_lights,
+    file_sources,
+    pair_up,
+    point_lights,
+    procedural_lights,
+    procedural_sources,
+    split_apart,
+)
+from ginn_jax.train import Training
+
+UNSEEN_SEED = 10_000_000
+VALIDATION_PATHS = 1024
+PATH_COUNTS = (1, 4, 16, 64)
+
+
+@dataclass(frozen=True)
+class LitOptions:
+    """What every effect that carries light can be told."""
+
+    out: Path = Path("runs/lit")
+    """Folder for data, checkpoints, metrics.json, report.md and figures."""
+    shapes: int = 240
+    """Procedural shapes to train on."""
+    meshes: Path | None = None
+    """A mesh file or a folder of meshes to train on as well."""
+    envmaps: Path | None = None
+    """An environment map or a folder of them to train on as well."""
+    lights: int = 1
+    """Lights for every object."""
+    test_shapes: int = 12
+    """Procedural shapes to evaluate on; training never sees them."""
+    test_meshes: Path | None = None
+    """A mesh file or a folder of unseen meshes to evaluate on as well."""
+    test_envmaps: Path | None = None
+    """Unseen environment maps to evaluate under, instead of procedural ones."""
+    split: Literal["default", "paper"] = "default"
+    """The paper's: 1,000 x 20, 200 x 5 and 500 x 5 objects and lights, 4,096 paths."""
+    paths: int = 32
+    """Paths per training point."""
+    points: int = 20_000
+    """Samples per object."""
+    schedule: Literal["cosine", "paper"] = "cosine"
+    """Learning rate: warm-up and cosine decay, or the paper's x0.7 every 10 epochs."""
+    steps: int = 3000
+    """Training steps."""
+    batch: int = 2
+    """Clouds per step (the paper: 8)."""
+    learning_rate: float = 0.005
+    """Adam's learning rate at its highest."""
+    resolution: int = 256
+    """Side of the evaluation images in pixels."""
+    resolution_scale: float = 0.5
+    """Shade the evaluation images at this share of their resolution too; 1: do not."""
+    seed: int = 0
+    """Seed of everything."""
+    resume: bool = False
+    """Go on where a killed run with the same options was."""
+    quick: bool = False
+    """A run of about a minute on little data: to try things, not for numbers."""
+
+
+QUICK = {
+    "shapes": 4,
+    "test_shapes": 2,
+    "steps": 10,
+    "points": 4000,
+    "resolution": 64,
+    "paths": 4,
+}
+
+
+def check(options: LitOptions) -> None:
+    """Raise `InputError` for options that cannot be meant."""
+    least = {"shapes": 0, "test_shapes": 1, "paths": 2, "points": 1000, "steps": 1}
+    least |= {"batch": 1, "resolution": 32, "seed": 0, "lights": 1}
+    require(options, least)
+    if not 0 < options.resolution_scale <= 1:
+        raise InputError(
+            f"--resolution-scale is {options.resolution_scale}: give it in (0, 1]"
+        )
+    if not (np.isfinite(options.learning_rate) and options.learning_rate > 0):
+        raise InputError(f"--learning-rate is {options.learning_rate}: give it above 0")
+
+
+def run_experiment(
+    options: LitOptions,
+    settings: Illumination | Scattering,
+    network: Network,
+    title: str,
+) -> dict[str, Any]:
+    """Data, training, evaluation and report of one effect; what metrics.json holds."""
+    check(options)
+    console, clock, begin = Console(), Clock(), time.perf_counter()
+    seen, unseen = choose_sources(options)
+    if options.split == "paper":
+        settings = replace(settings, points=PAPER_SPLIT.points, paths=PAPER_SPLIT.paths)
+    folder = options.out / "data"
+    clouds = make(console, "training clouds", seen, settings, folder / "training")
+    exact = replace(settings, paths=VALIDATION_PATHS, targets=settings.points // 5)
+    exact = exact if not options.quick else replace(exact, paths=16)
+    tests = {
+        name: make(console, f"unseen, {name}", sources, exact, folder / name)
+        for name, sources in unseen.items()
+    }
+    clock.lap("data", begin)
+
+    config = training(options, network, settings.points, len(clouds))
+    extra = {"data": asdict(settings), "objects": [s.name for s in seen]}
+    run = train(console, config, clouds, options.out, options.resume, extra)
+    clock.parts |= run.seconds
+
+    begin = time.perf_counter()
+    floor = unit_floor(clouds)
+    report.draw_curve(options.out / "learning_curve.png", run.losses, floor)
+    metrics = evaluation(options, run, config, exact, unseen, tests)
+    clock.lap("evaluation", begin)
+    metrics |= closing(options, run, config, clock)
+    report.write_results(options.out, metrics, write_report(title, metrics))
+    console.print(
+        f"relative 3D MSE {metrics['relative_mse_3d']:.2%} on unseen shapes and lights,"
+        f" {metrics['seconds_total'] / 60:.1f} minutes: {options.out / 'report.md'}"
+    )
+    return metrics
+
+
+def choose_sources(
+    options: LitOptions,
+) -> tuple[list[Source], dict[str, list[Source]]]:
+    """Objects under lights to train on, and those, by name of the set, to test on."""
+    seed, each = options.seed, options.lights
+    objects = procedural_sources(options.shapes, seed * 100_000)
+    objects += _files(options.meshes, find_meshes, file_sources)
+    lights = procedural_lights(max(options.shapes, 30), seed * 100_000)
+    lights += _files(options.envmaps, find_environments, file_lights)
+    if options.split == "paper":
+        return paper_sources(options, objects, lights)
+    lights = split_apart(lights, [len(lights)], seed)[0]
+    unseen = procedural_sources(options.test_shapes, UNSEEN_SEED + seed)
+    skies: list[LightSource] = _files(
+        options.test_envmaps, find_environments, file_lights
+    ) or procedural_lights(options.test_shapes, UNSEEN_SEED + seed)
+    sets = {"shapes": pair_up(unseen, skies, 1)}
+    lamps = point_lights(4, UNSEEN_SEED + seed)
+    sets["point lights"] = pair_up(unseen[:4], lamps, 1)
+    if files := _files(options.test_meshes, find_meshes, file_sources):
+        sets["meshes"] = pair_up(files, skies, 1)
+    return pair_up(objects, lights, each), sets
+
+
+def _files(path: Path | None, find: Callable, name: Callable) -> list[Any]:
+    return [] if path is None else name(find(path))
+
+
+def paper_sources(
+    options: LitOptions, objects: Sequence[Source], lights: Sequence[LightSource]
+) -> tuple[list[Source], dict[str, list[Source]]]:
+    """The paper's split of these objects and lights; validation and test are unseen."""
+    split = PAPER_SPLIT
+    parts = split.train, split.validation, split.test
+    objects_of = split_apart(objects, [count for count, _ in parts], options.seed)
+    lights_of = split_apart(lights, [count for _, count in parts], options.seed)
+    seen, validation, test = (
+        pair_up(o, lit, count)
+        for o, lit, (_, count) in zip(objects_of, lights_of, parts, strict=True)
+    )
+    return seen, {"shapes": validation, "meshes": test}
+
+
+def training(
+    options: LitOptions, network: Network, points: int, clouds: int
+) -> Training:
+    """The training configuration that the options ask for."""
+    return Training(
+        network,
+        steps=options.steps,
+        batch_size=options.batch,
+        points=points * 4 // 5,
+        queries=points // 5,
+        learning_rate=options.learning_rate,
+        schedule=options.schedule,
+        epoch_steps=max(clouds // options.batch, 1),
+        seed=options.seed,
+    )
+
+
+def unit_floor(clouds: Sequence[LitCloud]) -> float:
+    """Mean noise of the targets in the unit of the training loss."""
+    floors = []
+    for cloud in clouds:
+        scale = network_numbers(cloud)[1][..., 0].mean(axis=1)
+        lit = scale > 0
+        floors += (cloud.variance.mean(axis=0)[lit] / scale[lit] ** 2).tolist()
+    return float(np.mean(floors))
+
+
+def evaluation(
+    options: LitOptions,
+    run: fit.Fit,
+    config: Training,
+    settings: Illumination | Scattering,
+    unseen: dict[str, list[Source]],
+    clouds: dict[str, list[LitCloud]],
+) -> dict[str, Any]:
+    """All errors of the trained network; draws the figures."""
+    variables = jax.device_put(run.state.variables, jax.devices()[0])
+    model = Model(variables, jax.random.key(options.seed))
+    limits, metrics = run.limits, {}
+    for name, sources in unseen.items():
+        names = [source.name for source in sources]
+        rows, limits = evaluate_light.evaluate_lit_clouds(
+            config.network, limits, model, clouds[name], names, settings
+        )
+        pooled = evaluate_light.pool_lit_rows(rows)
+        metrics |= {f"unseen {name}": pooled, f"unseen {name}, each": rows}
+    shown = [(s[i], clouds[n][i]) for n, s in unseen.items() for i in range(2)][:6]
+    images = image_evaluation(options, config, limits, model, settings, shown)
+    return metrics["unseen shapes"] | metrics | images
+
+
+def image_evaluation(
+    options: LitOptions,
+    config: Training,
+    limits: Any,
+    model: Model,
+    settings: Illumination | Scattering,
+    shown: Sequence[tuple[Source, LitCloud]],
+) -> dict[str, Any]:
+    """Images of unseen objects, and error against run time on the same pixels."""
+    rows, pictures = [], []
+    paths = settings.paths // 4
+    for source, cloud in shown:
+        view = evaluate_light.lit_view(source, settings, paths, options.resolution)
+        given = config.network, limits, model, cloud, view
+        row, values, encoded, limits = evaluate_light.lit_network_row(*given)
+        units = np.asarray(encoded.scale)
+        rows.append(row | {"name": source.name})
+        pictures.append((source.name, panels(view, values)))
+        if options.resolution_scale < 1:
+            row, _, _, limits = evaluate_light.lit_network_row(
+                *given, options.resolution_scale
+            )
+            rows.append(row | {"name": source.name})
+        for count in PATH_COUNTS:
+            row = evaluate_light.path_row(view, count, 1000, units)
+            rows.append(row | {"name": source.name})
+    means = mean_rows(rows)
+    for row in means:
+        row["relative_mse_2d"] = row["mse_2d"] / row["variance_2d"]
+    groups = {
+        "network (f_3D + f_2D)": [r for r in means if "paths" not in r],
+        "path tracing": [r for r in means if "paths" in r],
+    }
+    report.draw_color_views(options.out / "views.png", pictures)
+    report.draw_error_against_time(options.out / "error_against_time.png", groups)
+    return {
+        "relative_mse_2d": means[0]["relative_mse_2d"],
+        "dssim_2d": means[0]["dssim_2d"],
+        "reference_paths": paths,
+        "error_against_time": means,
+        "error_against_time_rows": rows,
+    }
+
+
+def panels(view: evaluate_light.LitView, values: np.ndarray) -> list[np.ndarray]:
+    """Displayed reference and prediction, then the transported light of both alone."""
+    target, mask = view.pixels.target, view.gbuffer.mask
+    whole = (evaluate_light.displayed(view, light) for light in (target, values))
+    alone = (evaluate_light.fill(mask, light) for light in (target, values))
+    return [*whole, *alone]
+
+
+def write_report(title: str, m: dict[str, Any]) -> str:
+    """report.md: what was done, how good it is, how long it took."""
+    env, options = m["environment"], m["options"]
+    heads = {"set": "set", "clouds": "clouds", "relative_mse_3d": "relative 3D MSE"}
+    heads |= {"median_relative_mse_3d": "median", "mse_3d": "3D MSE"}
+    heads |= {"noise_floor_3d": "noise floor", "equal_rays": "equal paths"}
+    sets = [
+        {"set": name, **m[name]}
+        for name in m
+        if name.startswith("unseen ") and not name.endswith("each")
+    ]
+    times = {"method": "method", "relative_mse_2d": "relative 2D MSE"}
+    times |= {"mse_2d": "2D MSE", "dssim_2d": "DSSIM", "seconds_3d": "f_3D s"}
+    times |= {"seconds_2d": "f_2D s", "seconds": "total s"}
+    each = {
+        "name": "object and light",
+        "relative_mse_3d": "relative",
+        "mse_3d": "3D MSE",
+    }
+    each |= {"noise_floor_3d": "noise floor", "variance_3d": "variance"}
+    rows = [r for name in m if name.endswith(", each") for r in m[name]]
+    seconds = {k[8:]: v for k, v in m.items() if k.startswith("seconds_")}
+    network = m["training"]["network"]
+    kind = "linear in light" if network["linear"] else "homogeneous in light"
+    return f"""# {title}
+
+Network {kind}, levels {network["levels"]}, f_2D radius {network["query"]["radius"]},
+{m["steps"]} steps of {options["batch"]} clouds, seed {options["seed"]}.
+{env["processor"]}, {env["cores"]} cores, {env["devices"]} JAX devices,
+jax {env["packages"]["jax"]}, mitsuba {env["packages"]["mitsuba"]}.
+Skipped steps (non-finite gradient): {m["skipped_steps"]}. Limits raised on the way:
+{", ".join(m["limits_raised"]) or "none"}. Peak memory {m["peak_memory_gib"]:.2f} GiB.
+
+## Error at points
+
+In units of the squared mean light of each cloud and channel, against the expectation of
+the path-traced target (its noise is subtracted). Relative is over the variance of the
+target, pooled over clouds and channels as a ratio of means; equal paths is the number
+of paths per point at which path tracing has the same MSE.
+
+{report.table_of(sets, heads)}
+## Error against run time
+
+Means over {len(m["error_against_time_rows"]) // len(m["error_against_time"])} unseen
+objects at {options["resolution"]} x {options["resolution"]}, RGB, same pixels, same
+machine, same run; compilation, G-buffer and direct light apart. The reference has
+{m["reference_paths"]} paths a pixel, whose noise is subtracted. DSSIM of what is
+displayed, after the paper's tone mapping, over the foreground.
+
+{report.table_of(m["error_against_time"], times)}
+![error against run time](error_against_time.png)
+
+![reference and network, displayed and transported light alone](views.png)
+
+## Training
+
+![learning curve](learning_curve.png)
+
+{report.markdown_table(list(seconds), [[f"{v:.1f} s" for v in seconds.values()]])}
+## Every unseen object
+
+{report.table_of(rows, each)}"""

@@ -1,0 +1,152 @@
+"""Scenes with materials and a light, and the light transport that networks learn.
+
+Two effects: global illumination, of a diffuse object on diffuse ground, and subsurface
+scattering, of a translucent object in the air.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ginn_jax.errors import InputError
+from ginn_jax.irradiance import (
+    ColorEstimate,
+    LitScene,
+    direct_irradiance,
+    indirect_irradiance,
+    light_scene,
+)
+from ginn_jax.lit_clouds import LitCloud
+from ginn_jax.mesh import Samples, sample_surface
+from ginn_jax.objects import Source, load_light, load_object
+from ginn_jax.reference import Scene, ambient_occlusion, build_scene
+from ginn_jax.subsurface import Medium, subsurface_exitance
+
+FAR, PROBE_RAYS = 100.0, 32
+
+
+@dataclass(frozen=True)
+class Illumination:
+    """What makes the ground truth of global illumination.
+
+    points    samples of the surface
+    paths     paths per sample
+    looks     directions of the light per sample
+    targets   how many samples, the last ones, have a target (None: all)
+    """
+
+    points: int = 20_000
+    paths: int = 32
+    looks: int = 128
+    targets: int | None = None
+
+
+@dataclass(frozen=True)
+class Scattering:
+    """What makes the ground truth of subsurface scattering; `Illumination` has more.
+
+    The object's longest side measures `size` mm, and its medium's extinction is drawn
+    from an exponential distribution of mean `extinction` per mm (paper, section
+    "Training Data Generation"), kept between 1/10 and 5 times that.
+    """
+
+    points: int = 20_000
+    paths: int = 32
+    looks: int = 128
+    targets: int | None = None
+    size: float = 100.0
+    extinction: float = 0.1
+
+
+class Lit(NamedTuple):
+    """A scene ready for rays, the albedo of its materials, and the medium if any."""
+
+    scene: LitScene
+    albedo: Float[np.ndarray, "K 3"]
+    medium: Float[np.ndarray, "P"]
+
+
+def light_up(source: Source, settings: Illumination | Scattering) -> Lit:
+    """The scene of a source; its materials are drawn by its seed."""
+    scatters = isinstance(settings, Scattering)
+    mesh = load_object(source, ground=not scatters)
+    albedo = draw_albedo(source.seed)[: 1 if scatters else 2]
+    medium = draw_medium(source.seed, settings) if scatters else np.zeros(0)
+    return Lit(light_scene(mesh, albedo, load_light(source)), albedo, medium)
+
+
+def draw_albedo(seed: int) -> Float[np.ndarray, "2 3"]:
+    """Uniform RGB albedos of object and ground."""
+    return np.random.default_rng((seed, 4)).uniform(0, 1, (2, 3)).astype(np.float32)
+
+
+def draw_medium(seed: int, settings: Scattering) -> Float[np.ndarray, "2"]:
+    """Extinction per length of the object, and index of refraction."""
+    rng = np.random.default_rng((seed, 5))
+    relative = np.clip(rng.exponential(), 0.1, 5.0)
+    per_length = relative * settings.extinction * settings.size
+    return np.array([per_length, rng.uniform(1.0, 1.5)])
+
+
+def transport(
+    lit: Lit,
+    position: Float[np.ndarray, "N 3"],
+    normal: Float[np.ndarray, "N 3"],
+    *,
+    paths: int,
+    seed: int,
+) -> ColorEstimate:
+    """Indirect irradiance, or radiant exitance where there is a medium."""
+    if lit.medium.size == 0:
+        return indirect_irradiance(lit.scene, position, normal, paths=paths, seed=seed)
+    extinction, ior = (float(x) for x in lit.medium)
+    medium = Medium(lit.albedo[0], extinction, ior)
+    ends = lit.scene, medium, position, normal
+    return subsurface_exitance(*ends, paths=paths, seed=seed)[0]
+
+
+def lit_cloud(source: Source, settings: Illumination | Scattering) -> LitCloud:
+    """Uniform samples of a scene, the light on them, and what transport makes of it."""
+    lit, seed = light_up(source, settings), source.seed
+    samples = visible_samples(build_scene(lit.scene.mesh), settings.points, seed)
+    position, normal, material = samples
+    irradiance = direct_irradiance(
+        lit.scene, position, normal, samples=settings.looks, seed=seed
+    )
+    asked = slice(-(settings.targets or len(position)), None)
+    ends = position[asked], normal[asked]
+    truth = transport(lit, *ends, paths=settings.paths, seed=seed)
+    target, variance = np.zeros_like(irradiance), np.zeros_like(irradiance)
+    target[asked], variance[asked] = truth
+    light = irradiance, target, variance
+    return LitCloud(position, normal, material, *light, lit.albedo, lit.medium)
+
+
+def visible_samples(scene: Scene, count: int, seed: int) -> Samples:
+    """Uniform samples of the surface that light can reach.
+
+    Meshes of many parts hide surface inside other parts, where no camera can be; it
+    would only take points away from what is seen. A sample is dropped if none of
+    `PROBE_RAYS` rays from it leaves the scene.
+
+    Raises:
+        InputError: a scene that is almost all sealed off.
+    """
+    drawn = count
+    for _ in range(5):
+        samples = sample_surface(scene.mesh, drawn, seed=seed)
+        sky = ambient_occlusion(
+            scene,
+            samples.position,
+            samples.normal,
+            FAR,
+            rays=PROBE_RAYS,
+            seed=seed,
+        )
+        seen = np.flatnonzero(sky.mean > 0)
+        if len(seen) >= count:
+            return Samples(*(a[seen[:count]] for a in samples))
+        drawn = 2 * drawn
+    raise InputError("nearly all of the mesh's surface is sealed inside it: mend it")
