@@ -193,6 +193,8 @@ def test_twice_the_light_gives_exactly_twice_the_exitance():
 def volpath_exitance(shape, medium, points, normals, paths):
     """The same under a sky of radiance 1, by Mitsuba's `volpath` and `dielectric`."""
     mi, variant = use_mitsuba()
+    import drjit as dr
+
     with mi.variant_context(variant):
         alpha = single_scattering_albedo(medium.albedo, medium.ior)
         parts = mi.Properties()
@@ -227,7 +229,9 @@ def volpath_exitance(shape, medium, points, normals, paths):
         radiance, _, _ = integrator.sample(
             scene, sampler, mi.RayDifferential3f(cast), inside, leaves > 0
         )
-        return irradiance.summarize(np.pi * leaves * radiance, paths)
+        values = np.pi * leaves * radiance
+        dr.eval(values)
+        return irradiance.summarize(values, paths)
 
 
 @pytest.mark.parametrize("shape", [BALL, SLAB], ids=["ball", "slab"])
