@@ -16,6 +16,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     reference         ambient occlusion and G-buffers by ray tracing
     lighting          environment maps, procedural skies, point lights
     irradiance        direct and indirect irradiance by path tracing
+    subsurface        light that leaves a translucent object, by random walks
     voxels            fixed-capacity voxel hash under jit
     packets           radius search by packets of queries under jit
     neighbors         radius search on the host: exact, sizes itself

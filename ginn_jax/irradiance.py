@@ -50,9 +50,8 @@ def light_scene(mesh: Mesh, albedo: Float[np.ndarray, "K 3"], light: Light) -> L
     mi, variant = use_mitsuba()
     with mi.variant_context(variant):
         parts: dict[str, Any] = {"type": "scene", "light": emitter(light)}
-        parts |= {
-            f"material_{k}": _shape(mesh, k, albedo[k]) for k in set(mesh.material)
-        }
+        used = np.unique(mesh.material).tolist()
+        parts |= {f"material_{k}": _shape(mesh, k, albedo[k]) for k in used}
         return LitScene(mesh, light, mi.load_dict(parts))
 
 
