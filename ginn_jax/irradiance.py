@@ -132,6 +132,7 @@ def _direct(
         toward, radiance = scene.handle.sample_emitter_direction(receiver, square)
         cosine = dr.fmax(dr.dot(toward.d, normal), 0)
         arrived = dr.select(toward.pdf > 0, radiance * cosine, 0)
+        dr.eval(arrived)
         total = [dr.block_reduce(dr.ReduceOp.Add, c, samples) for c in arrived]
         return np.stack([c.numpy() for c in total], axis=1) / samples
 
@@ -185,6 +186,9 @@ def _indirect(
 def summarize(values: Any, paths: int) -> ColorEstimate:
     """Mean of every `paths` successive values, and the variance of that mean."""
     import drjit as dr
+
+    # Or each of the sums below would trace all paths anew.
+    dr.eval(values)
 
     def mean(value: Any) -> np.ndarray:
         total = dr.block_reduce(dr.ReduceOp.Add, value, paths)

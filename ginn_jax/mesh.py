@@ -17,6 +17,9 @@ from ginn_jax import orientation
 from ginn_jax.errors import InputError, InputWarning
 
 
+GROUND_GAP = 1e-4
+
+
 class Mesh(NamedTuple):
     """Triangles with one material index a face: 0 is the object, 1 the ground."""
 
@@ -143,11 +146,14 @@ def fit_unit_box_points(samples: Samples) -> Samples:
 
 
 def add_ground(mesh: Mesh, half_extent: float = 0.8) -> Mesh:
-    """The mesh and, at its lowest vertex, a square of material 1 facing +y.
+    """The mesh and, just below its lowest vertex, a square of material 1 facing +y.
+
+    The gap keeps a flat base from lying in the same plane: what starts on either would
+    be on the wrong side of the other.
 
     The square is centred at x = z = 0; `half_extent` is half its side.
     """
-    low, h = mesh.vertices[:, 1].min(), half_extent
+    low, h = mesh.vertices[:, 1].min() - GROUND_GAP, half_extent
     square = [[-h, low, -h], [-h, low, h], [h, low, h], [h, low, -h]]
     faces = np.array([[0, 1, 2], [0, 2, 3]]) + len(mesh.vertices)
     return Mesh(

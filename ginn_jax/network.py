@@ -17,6 +17,8 @@ from ginn_jax.mcconv import init_kernel, mc_conv, mc_conv_mixing
 from ginn_jax.receptive_field import Field
 
 SLOPE = 0.2
+# The collection that gates are put in where a caller, `relight`, wants to keep them.
+GATES = "gates"
 Variables = dict[str, Any]
 
 
@@ -73,6 +75,7 @@ class Gate(nn.Module):
     ) -> Float[Array, "N W"]:
         ones = nn.initializers.ones_init()
         gate = nn.Dense(self.width, bias_init=ones, name="gate")(free)
+        self.sow(GATES, "gate", gate)
         return gate * nn.Dense(self.width, use_bias=False, name="light")(light)
 
 
@@ -111,8 +114,8 @@ class McConv(nn.Module):
         if conv.mixes:
             given = kernel, free, field, receivers, conv.channels
             return Code(mc_conv_mixing(*given), None)
-        found = mc_conv(kernel, both, field, receivers)
         width = free.shape[1]
+        found = mc_conv(kernel, both, field, receivers)
         return Code(found[:, :width], None if light is None else found[:, width:])
 
 
