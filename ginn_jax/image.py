@@ -71,7 +71,7 @@ def encode(
         scale = None
         if light is not None:
             light, scale = unit_light(light, mask)
-        given = points_asked(finest, *_take((material, light), rows, finest.mask))
+        given = points_asked(finest, *take_rows((material, light), rows, finest.mask))
         encoder = Encoder(network, train=False)
         code: Any = encoder.apply(variables["encoder"], *given, geometry)
         return code, scale
@@ -100,7 +100,7 @@ def shade(
     ) -> Float[Array, "M"]:
         if light is not None and scale is not None:
             light = light * safe_inverse(scale)
-        numbers = _take((material, light), order, queries.mask)
+        numbers = take_rows((material, light), order, queries.mask)
         asked = queries_asked(network, queries, *numbers)
         shader = Shader(network, train=False)
         values: Any = shader.apply(
@@ -122,7 +122,7 @@ def per_channel(function: Any, *arrays: Any) -> Any:
     return function(*arrays) if arrays[1] is None else jax.vmap(function)(*arrays)
 
 
-def _take(
+def take_rows(
     columns: tuple[Array | None, Array | None],
     rows: Int[Array, "M"],
     mask: Bool[Array, "M"],
@@ -162,7 +162,7 @@ def encode_cloud(
     padded, mask = pad_rows(np.asarray(position, np.float32), rows)
     turned, _ = pad_rows(np.asarray(normal, np.float32), rows)
     cloud = Oriented(padded, turned, mask)
-    more = _pad_channels(material, rows), _pad_channels(light, rows)
+    more = pad_channels(material, rows), pad_channels(light, rows)
     while True:
         deep = _without(limits, network.query.name)
         encoded, demands = _encode(network, deep, variables, cloud, *more, key)
@@ -172,7 +172,7 @@ def encode_cloud(
         limits = raise_limits(limits, short, SLACK)
 
 
-def _pad_channels(
+def pad_channels(
     numbers: Float[np.ndarray, "C N A"] | None, rows: int
 ) -> Float[np.ndarray, "C R A"] | None:
     """Zeros for rows up to `rows`."""
@@ -218,7 +218,7 @@ def shade_points(
             turned, _ = pad_rows(np.asarray(normal[block], np.float32), size)
             queries = Oriented(place, turned, mask)
             numbers = (
-                None if a is None else _pad_channels(a[:, block], size)
+                None if a is None else pad_channels(a[:, block], size)
                 for a in (material, light)
             )
             arrays = copies[number % len(copies)]

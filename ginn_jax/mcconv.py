@@ -101,7 +101,7 @@ def apply_stored(
     """
     given = Field(field.sender, field.receiver, stored, field.weight, field.count)
     width = features.shape[1]
-    return _convolve(_stored, receivers, width, None, features, given)  # type: ignore[arg-type]
+    return _convolve(_stored, receivers, width, None, features, given)
 
 
 def _stored(
@@ -173,7 +173,7 @@ def _convolve(
     combine: Any,
     receivers: int,
     outputs: int,
-    kernel: Kernel,
+    kernel: Kernel | None,
     features: Float[Array, "N C"],
     field: Field,
 ) -> Float[Array, "M K"]:

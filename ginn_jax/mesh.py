@@ -16,7 +16,6 @@ from trimesh.exchange.load import mesh_formats
 from ginn_jax import orientation
 from ginn_jax.errors import InputError, InputWarning
 
-
 GROUND_GAP = 1e-4
 
 

@@ -75,7 +75,8 @@ class Gate(nn.Module):
     ) -> Float[Array, "N W"]:
         ones = nn.initializers.ones_init()
         gate = nn.Dense(self.width, bias_init=ones, name="gate")(free)
-        self.sow(GATES, "gate", gate)
+        if not self.is_initializing():
+            self.sow(GATES, "value", gate)
         return gate * nn.Dense(self.width, use_bias=False, name="light")(light)
 
 

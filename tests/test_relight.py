@@ -1,0 +1,123 @@
+"""Relighting gives what shading from scratch gives, and both are linear in light."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+import tiny
+
+from ginn_jax import image, train
+from ginn_jax.errors import InputError
+from ginn_jax.lit_clouds import LitCloud, network_numbers
+from ginn_jax.relight import prepare_relighting, relight
+
+KEY = jax.random.key(1)
+EFFECTS = {
+    "illumination": replace(tiny.NETWORK, linear=True, materials=1, lights=1),
+    "scattering": replace(tiny.NETWORK, linear=True, materials=3, lights=1, asks="all"),
+    "homogeneous": replace(tiny.NETWORK, materials=1, lights=1),
+}
+
+
+def lit(count, seed, medium=()):
+    """The sphere on its plane, two materials, random light on every point."""
+    points = tiny.sphere_on_plane(count, seed)
+    rng = np.random.default_rng(seed)
+    light = rng.gamma(0.5, size=(3, count, 3)).astype(np.float32)
+    albedo = rng.uniform(0, 1, (2, 3)).astype(np.float32)
+    material = (points.position[:, 1] < 1e-6).astype(np.int32)
+    columns = points.position, points.normal, material, *light
+    return LitCloud(*columns, albedo, np.array(medium))
+
+
+@pytest.fixture(scope="module", params=EFFECTS)
+def case(request):
+    """A network with its weights, a cloud and queries."""
+    network = EFFECTS[request.param]
+    medium = (8.0, 1.3) if network.materials == 3 else ()
+    config = replace(tiny.CONFIG, network=network)
+    with tiny.cheap_compiling():
+        variables = jax.device_get(train.init_state(config).variables)
+    return network, variables, lit(1000, 1, medium), lit(300, 2, medium)
+
+
+def shade(network, variables, cloud, queries):
+    ends = variables, cloud.position, cloud.normal, *network_numbers(cloud)
+    encoded, limits = image.encode_cloud(network, tiny.LIMITS, *ends, key=KEY)
+    ends = variables, encoded, queries.position, queries.normal
+    numbers = network_numbers(queries)
+    return image.shade_points(network, limits, *ends, *numbers)[0]
+
+
+def scaled(cloud, factor):
+    return cloud._replace(irradiance=np.float32(factor) * cloud.irradiance)
+
+
+def close(a, b, tolerance=1e-4):
+    np.testing.assert_allclose(a, b, atol=tolerance * np.abs(b).max())
+
+
+def test_output_scales_with_light(case):
+    network, variables, cloud, queries = case
+    once = shade(network, variables, cloud, queries)
+    assert np.abs(once).max() > 1e-3
+    for factor in (1e-4, 3.0, 1e5):
+        more = scaled(cloud, factor), scaled(queries, factor)
+        close(shade(network, variables, *more) / factor, once)
+
+
+def test_no_light_gives_none(case):
+    network, variables, cloud, queries = case
+    dark = shade(network, variables, scaled(cloud, 0), scaled(queries, 0))
+    np.testing.assert_array_equal(dark, 0)
+
+
+def test_channels_are_alike(case):
+    network, variables, cloud, queries = case
+    once = shade(network, variables, cloud, queries)
+
+    def swapped(c):
+        return c._replace(irradiance=c.irradiance[:, ::-1], albedo=c.albedo[:, ::-1])
+
+    turned = shade(network, variables, swapped(cloud), swapped(queries))
+    close(turned[:, ::-1], once, 1e-5)
+
+
+def test_lights_add_up_where_the_network_is_linear(case):
+    network, variables, cloud, queries = case
+    rng = np.random.default_rng(5)
+    others = [
+        c._replace(irradiance=rng.gamma(0.3, size=c.irradiance.shape).astype("f4"))
+        for c in (cloud, queries)
+    ]
+    both = [
+        c._replace(irradiance=c.irradiance + o.irradiance)
+        for c, o in zip((cloud, queries), others, strict=True)
+    ]
+    parts = [shade(network, variables, *c) for c in ((cloud, queries), others)]
+    whole = shade(network, variables, *both)
+    if network.linear:
+        close(parts[0] + parts[1], whole)
+    else:
+        assert np.abs(parts[0] + parts[1] - whole).max() > 1e-3 * np.abs(whole).max()
+
+
+def test_relighting_is_shading(case):
+    network, variables, cloud, queries = case
+    given = network, tiny.LIMITS, variables, cloud, queries
+    if not network.linear:
+        with pytest.raises(InputError, match="not linear"):
+            prepare_relighting(*given, key=KEY)
+        return
+    ready, _ = prepare_relighting(*given, key=KEY)
+    rng = np.random.default_rng(7)
+    for factor in (1.0, 20.0):
+        lights = [
+            c._replace(
+                irradiance=rng.gamma(factor, size=c.irradiance.shape).astype("f4")
+            )
+            for c in (cloud, queries)
+        ]
+        expected = np.maximum(shade(network, variables, *lights), 0)
+        close(relight(network, ready, *lights), expected)
