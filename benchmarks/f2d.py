@@ -20,7 +20,7 @@ import numpy as np
 
 from benchmarks.straightforward import shade_plainly
 from benchmarks.timing import Timing, describe, load, measure
-from ginn_jax import image, lit_scenes, objects, reference, report
+from ginn_jax import image, lit_scenes, objects, reference, report, shading
 from ginn_jax.architecture import Network, compact_network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
@@ -161,7 +161,7 @@ def block_memory(
     zeros = np.zeros((rows, 3), np.float32)
     queries = Oriented(zeros, zeros, np.ones(rows, bool))
     flat = image.only(limits, network.query.name)
-    shade = jax.jit(image.shade, static_argnums=(0, 1))
+    shade = jax.jit(shading.shade, static_argnums=(0, 1))
     compiled = shade.lower(network, flat, variables, encoded, queries).compile()
     memory = compiled.memory_analysis()
     return int(memory.temp_size_in_bytes) if memory else 0

@@ -6,131 +6,23 @@ too small they raise it and try again; the limits that sufficed come back for re
 """
 
 from dataclasses import replace
-from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Key
 
 from ginn_jax.architecture import Network
-from ginn_jax.dataset import safe_inverse, unit_light
 from ginn_jax.errors import InputError
-from ginn_jax.example import points_asked, queries_asked
-from ginn_jax.geometry import (
-    Demands,
-    Limits,
-    build_geometry,
-    build_query_field,
-    exceeded,
-    limits_for,
-    raise_limits,
-)
+from ginn_jax.geometry import Limits, exceeded, limits_for, raise_limits
 from ginn_jax.neighbors import bucket, pad_rows
-from ginn_jax.network import Code, Encoder, Shader, Variables
+from ginn_jax.network import Variables
 from ginn_jax.process import ALONE
-from ginn_jax.receptive_field import Oriented, in_coherent_order
+from ginn_jax.receptive_field import Oriented
+from ginn_jax.shading import Encoded, encode, shade
 from ginn_jax.upsample import Surface, sample_pixels, upsample
-from ginn_jax.voxels import VoxelGrid
 
 BLOCK = 1 << 14
 SLACK = 1.25
-
-
-class Encoded(NamedTuple):
-    """What f_2D needs of a cloud: its finest level, searchable, with codes.
-
-    Where there is light, `code` has a leading axis of channels and `scale` is the mean
-    light of each channel; else `scale` is None.
-    """
-
-    points: Oriented
-    grid: VoxelGrid
-    area: Array | None
-    code: Code
-    scale: Float[Array, "C"] | None
-
-
-def encode(
-    network: Network,
-    limits: Limits,
-    variables: Variables,
-    cloud: Oriented,
-    material: Float[Array, "C N A"] | None,
-    light: Float[Array, "C N L"] | None,
-    key: Key[Array, ""],
-) -> tuple[Encoded, Demands]:
-    """f_3D with all its geometry, which the channels share."""
-    mask = cloud.mask
-    cloud, order = in_coherent_order(cloud)
-    geometry, demands = build_geometry(network, limits, cloud, key=key)
-    finest = geometry.levels[0]
-    rows = order[geometry.finest]
-
-    def channel(material: Array | None, light: Array | None) -> tuple[Code, Any]:
-        scale = None
-        if light is not None:
-            light, scale = unit_light(light, mask)
-        given = points_asked(finest, *take_rows((material, light), rows, finest.mask))
-        encoder = Encoder(network, train=False)
-        code: Any = encoder.apply(variables["encoder"], *given, geometry)
-        return code, scale
-
-    code, scale = per_channel(channel, material, light)
-    return Encoded(finest, geometry.grid, geometry.area, code, scale), demands
-
-
-def shade(
-    network: Network,
-    limits: Limits,
-    variables: Variables,
-    encoded: Encoded,
-    queries: Oriented,
-    material: Float[Array, "C M A"] | None = None,
-    light: Float[Array, "C M L"] | None = None,
-) -> tuple[Float[Array, "*C M"], Demands]:
-    """f_2D with its search, for one block of queries in any order."""
-    queries, order = in_coherent_order(queries)
-    field, demands = build_query_field(
-        network, limits, encoded.points, encoded.grid, encoded.area, queries
-    )
-
-    def channel(
-        code: Code, scale: Array | None, material: Array | None, light: Array | None
-    ) -> Float[Array, "M"]:
-        if light is not None and scale is not None:
-            light = light * safe_inverse(scale)
-        numbers = take_rows((material, light), order, queries.mask)
-        asked = queries_asked(network, queries, *numbers)
-        shader = Shader(network, train=False)
-        values: Any = shader.apply(
-            variables["shader"], code, *asked, queries.mask, field
-        )
-        values = jnp.zeros_like(values).at[order].set(values)
-        return values if scale is None else values * scale
-
-    if network.asks == "normal":
-        material = light = None
-    return per_channel(channel, encoded.code, encoded.scale, material, light), demands
-
-
-def per_channel(function: Any, *arrays: Any) -> Any:
-    """`function` for every channel; geometry and kernels are computed once.
-
-    Without light (the second argument is None) there is one channel and no axis of it.
-    """
-    return function(*arrays) if arrays[1] is None else jax.vmap(function)(*arrays)
-
-
-def take_rows(
-    columns: tuple[Array | None, Array | None],
-    rows: Int[Array, "M"],
-    mask: Bool[Array, "M"],
-) -> tuple[Array | None, ...]:
-    """Rows of what there is, zero where masked."""
-    return tuple(
-        None if a is None else jnp.where(mask[:, None], a[rows], 0.0) for a in columns
-    )
 
 
 _encode = jax.jit(encode, static_argnums=(0, 1))
@@ -164,7 +56,7 @@ def encode_cloud(
     cloud = Oriented(padded, turned, mask)
     more = pad_channels(material, rows), pad_channels(light, rows)
     while True:
-        deep = _without(limits, network.query.name)
+        deep = without(limits, network.query.name)
         encoded, demands = _encode(network, deep, variables, cloud, *more, key)
         short = exceeded(limits, demands)
         if not short:
@@ -187,7 +79,7 @@ def only(limits: Limits, conv: str) -> Limits:
     return Limits(tuple(s for s in limits.sizes if s[0].startswith(f"{conv}.")))
 
 
-def _without(limits: Limits, conv: str) -> Limits:
+def without(limits: Limits, conv: str) -> Limits:
     """The limits of everything else."""
     return Limits(tuple(s for s in limits.sizes if not s[0].startswith(f"{conv}.")))
 

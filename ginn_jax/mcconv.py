@@ -82,37 +82,32 @@ def mc_conv_mixing(
     return _convolve(_mixing, receivers, outputs, kernel, features, field)
 
 
-def stored_kernel(kernel: Kernel, first: int, field: Field) -> Float[Array, "K E"]:
-    """Weighted kernel values of the channels from `first` on, for `apply_stored`."""
+def stored_kernel(kernel: Kernel, field: Field) -> Float[Array, "K E"]:
+    """Weighted kernel values of every edge, for `apply_stored`."""
     outputs = kernel.w1.shape[0] * kernel.w3.shape[2]
-    values = evaluate_kernel(kernel, field.inputs, outputs)[:, first:]
+    values = evaluate_kernel(kernel, field.inputs, outputs)
     return (values * field.weight[:, None]).T
 
 
 def apply_stored(
     stored: Float[Array, "K E"],
-    features: Float[Array, "N W"],
+    features: Float[Array, "N C"],
     field: Field,
     receivers: int,
-) -> Float[Array, "M W"]:
-    """Depth-wise convolution with kernel values at hand, for several lights at once.
-
-    Feature c * K + k is that of light c and channel k.
-    """
-    given = Field(field.sender, field.receiver, stored, field.weight, field.count)
-    width = features.shape[1]
-    return _convolve(_stored, receivers, width, None, features, given)
+) -> Float[Array, "M C"]:
+    """`mc_conv` with kernel values at hand."""
+    given = field._replace(inputs=stored[: features.shape[1]])
+    return _convolve(_stored, receivers, features.shape[1], None, features, given)
 
 
 def _stored(
     kernel: None,
     outputs: int,
-    features: Float[Array, "T W"],
-    inputs: Float[Array, "K T"],
+    features: Float[Array, "T C"],
+    inputs: Float[Array, "C T"],
     weight: Float[Array, "T"],
-) -> Float[Array, "T W"]:
-    values = jnp.tile(inputs.T, (1, outputs // inputs.shape[0]))
-    return features * values
+) -> Float[Array, "T C"]:
+    return features * inputs.T
 
 
 def _depth_wise(

@@ -13,12 +13,12 @@ from jaxtyping import Array, Bool, Float
 
 from ginn_jax.architecture import Conv, Network
 from ginn_jax.geometry import Geometry
-from ginn_jax.mcconv import init_kernel, mc_conv, mc_conv_mixing
+from ginn_jax.mcconv import apply_stored, init_kernel, mc_conv, mc_conv_mixing
 from ginn_jax.receptive_field import Field
 
 SLOPE = 0.2
-# The collection that gates are put in where a caller, `relight`, wants to keep them.
-GATES = "gates"
+# The collection of kernel values that are at hand already, see `relight`.
+STORED = "stored"
 Variables = dict[str, Any]
 
 
@@ -75,8 +75,6 @@ class Gate(nn.Module):
     ) -> Float[Array, "N W"]:
         ones = nn.initializers.ones_init()
         gate = nn.Dense(self.width, bias_init=ones, name="gate")(free)
-        if not self.is_initializing():
-            self.sow(GATES, "value", gate)
         return gate * nn.Dense(self.width, use_bias=False, name="light")(light)
 
 
@@ -116,7 +114,11 @@ class McConv(nn.Module):
             given = kernel, free, field, receivers, conv.channels
             return Code(mc_conv_mixing(*given), None)
         width = free.shape[1]
-        found = mc_conv(kernel, both, field, receivers)
+        if self.has_variable(STORED, "kernel"):
+            stored = self.get_variable(STORED, "kernel")
+            found = apply_stored(stored, both, field, receivers)
+        else:
+            found = mc_conv(kernel, both, field, receivers)
         return Code(found[:, :width], None if light is None else found[:, width:])
 
 
