@@ -27,6 +27,9 @@ from ginn_jax.geometry import uniform_limits
 from ginn_jax.mesh import sample_surface
 from ginn_jax.train import Training, init_state
 
+# Of the cloud under the frames.
+FRAME_POINTS = 16_000
+
 
 @dataclass(frozen=True)
 class Options:
@@ -81,9 +84,9 @@ def over_points(options: Options, scene: reference.Scene) -> list[dict[str, Any]
 
 def over_pixels(options: Options, scene: reference.Scene) -> list[dict[str, Any]]:
     """f_2D, for frames of each size; its scratch memory is that of a block."""
-    network = network_for(16_000)
+    network = network_for(FRAME_POINTS)
     variables = weights_of(network)
-    cloud = scenes.visible_samples(scene, 16_000, seed=0)
+    cloud = scenes.visible_samples(scene, FRAME_POINTS, seed=0)
     limits = uniform_limits(network, 1 << 17)
     encoded, limits = image.encode_cloud(
         network,
