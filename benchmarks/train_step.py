@@ -27,7 +27,7 @@ from ginn_jax.dataset import ShadedPoints, stack_clouds
 from ginn_jax.errors import InputError
 from ginn_jax.geometry import Limits
 from ginn_jax.network import Variables
-from ginn_jax.process import available_cores
+from ginn_jax.process import ALONE, available_cores
 from ginn_jax.train import (
     Training,
     TrainState,
@@ -133,7 +133,8 @@ def stage_call(
         check_vma=False,
     )
     key = jax.random.key(config.seed)
-    return partial(jax.jit(split), fresh.variables, key, batch)
+    call = jax.jit(split, compiler_options=ALONE)
+    return partial(call, fresh.variables, key, batch)
 
 
 def differences(timings: Iterable[Timing]) -> list[float]:

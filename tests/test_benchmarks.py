@@ -144,7 +144,8 @@ def test_stages_of_the_step(stage):
     """Traced only: compiling them takes long and adds nothing."""
     config = replace(tiny.CONFIG, network=tiny.ONE_LEVEL)
     setting = config, tiny.ONE_LEVEL_LIMITS, stage, untrained(config), tiny.batch()
-    first, second = jax.eval_shape(train_step.stage_call(*setting))
+    call = train_step.stage_call(*setting)
+    first, second = call.func.eval_shape(*call.args)
     rows = tiny.ONE_LEVEL_LIMITS.sizes[0][1]
     if stage == "levels":
         assert first[0].position.shape == (1, rows, 3)
