@@ -9,7 +9,7 @@ and agreement do not depend on them. Results are compared before anything is tim
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.straightforward import shade_plainly
-from benchmarks.timing import Timing, describe, load, measure
+from benchmarks.timing import Timing, circumstances, describe, measure
 from ginn_jax import image, reference, report, scenes
 from ginn_jax.architecture import Network, compact_network
 from ginn_jax.camera import orbit_camera
@@ -178,12 +178,7 @@ def main(options: Options) -> dict[str, Any]:
     text = write_report(options, cases)
     for case in cases:
         case["timings"] = {n: t.record() for n, t in case["timings"].items()}
-    metrics = {
-        "cases": cases,
-        "options": {k: str(v) for k, v in asdict(options).items() if k != "out"},
-        "environment": report.environment() | {"load": load()},
-        "seconds_total": time.perf_counter() - begin,
-    }
+    metrics = {"cases": cases} | circumstances(options, begin)
     report.write_results(options.out, metrics, text)
     print(text)
     return metrics

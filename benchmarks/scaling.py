@@ -8,7 +8,7 @@ of one scene. Slopes are of the logarithms, fitted over all sizes: 1 is linear.
 """
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.f2d import UNSEEN_SEED, block_memory
-from benchmarks.timing import Timing, describe, load, measure
+from benchmarks.timing import Timing, circumstances, describe, measure
 from ginn_jax import image, reference, report, scenes
 from ginn_jax.architecture import Network, compact_network
 from ginn_jax.camera import orbit_camera
@@ -129,21 +129,12 @@ def main(options: Options) -> dict[str, Any]:
     slopes = {name: slope(rows) for name, rows in tables.items()}
     peak = report.peak_memory_gib()
     text = write_report(options, tables, slopes, peak)
-    report.write_results(
-        options.out,
-        {
-            "tables": {
-                name: [r | {"timing": r["timing"].record()} for r in rows]
-                for name, rows in tables.items()
-            },
-            "slopes": slopes,
-            "peak_memory_gib": peak,
-            "options": {k: v for k, v in asdict(options).items() if k != "out"},
-            "environment": report.environment() | {"load": load()},
-            "seconds_total": time.perf_counter() - begin,
-        },
-        text,
-    )
+    records = {
+        name: [r | {"timing": r["timing"].record()} for r in rows]
+        for name, rows in tables.items()
+    }
+    metrics = {"tables": records, "slopes": slopes, "peak_memory_gib": peak}
+    report.write_results(options.out, metrics | circumstances(options, begin), text)
     draw(options.out / "scaling.png", tables)
     print(text)
     return {"slopes": slopes, "tables": tables}

@@ -20,7 +20,7 @@ from jax.sharding import PartitionSpec
 from jaxtyping import Array, Key
 from matplotlib.figure import Figure
 
-from benchmarks.timing import Timing, describe, load, measure
+from benchmarks.timing import Timing, circumstances, measure
 from ginn_jax import architecture, fit, report, scenes
 from ginn_jax.commandline import require, start
 from ginn_jax.dataset import ShadedPoints, stack_clouds
@@ -197,11 +197,7 @@ def main(options: Options) -> dict[str, Any]:
         "geometry_share": max(c["geometry_share"] for c in columns.values()),
         "limits": dict(limits.sizes),
         "training": asdict(config),
-        "options": asdict(options),
-        "environment": report.environment() | {"load": load()},
-        "machine": describe(),
-        "seconds_total": time.perf_counter() - begin,
-    }
+    } | circumstances(options, begin)
     text = write_report(metrics)
     report.write_results(options.out, metrics, text)
     draw(options.out / "train_step.png", columns)
