@@ -9,7 +9,7 @@ and agreement do not depend on them. Results are compared before anything is tim
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.straightforward import shade_plainly
-from benchmarks.timing import Timing, describe, load, measure
-from ginn_jax import image, lit_scenes, objects, reference, report, shading
+from benchmarks.timing import Timing, circumstances, describe, measure
+from ginn_jax import image, lit_scenes, objects, reference, report
 from ginn_jax.architecture import Network, compact_network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
@@ -46,6 +46,8 @@ class Options:
     """A mesh file; without it a procedural shape."""
     resolution: int = 1024
     """Side of the frame in pixels."""
+    points: int = 20_000
+    """Samples of the object before the disk."""
     disks: tuple[float, ...] = (0.01, 0.02, 0.02)
     """Poisson disk radii of the finest level, one for each f_2D radius."""
     radii: tuple[float, ...] = (0.025, 0.035, 0.05)
@@ -107,7 +109,7 @@ def compare(
     )
     state = init_state(Training(network, steps=1))
     variables = jax.device_put(state.variables, jax.devices()[0])
-    cloud = lit_scenes.visible_samples(scene, 20_000, seed=0)
+    cloud = lit_scenes.visible_samples(scene, options.points, seed=0)
     key = jax.random.key(0)
     limits = uniform_limits(network, 1 << 17)
     encoded, limits = image.encode_cloud(
@@ -161,15 +163,14 @@ def block_memory(
     zeros = np.zeros((rows, 3), np.float32)
     queries = Oriented(zeros, zeros, np.ones(rows, bool))
     flat = image.only(limits, network.query.name)
-    shade = jax.jit(shading.shade, static_argnums=(0, 1))
-    compiled = shade.lower(network, flat, variables, encoded, queries).compile()
-    memory = compiled.memory_analysis()
+    lowered = image.shade_block.lower(network, flat, variables, encoded, queries)
+    memory = lowered.compile().memory_analysis()
     return int(memory.temp_size_in_bytes) if memory else 0
 
 
 def main(options: Options) -> dict[str, Any]:
     """Compare every network on one frame; returns what metrics.json holds."""
-    require(options, {"resolution": 32, "repeats": 1, "hidden": 1})
+    require(options, {"resolution": 32, "points": 500, "repeats": 1, "hidden": 1})
     begin = time.perf_counter()
     scene, gbuffer = make_frame(options)
     pairs = zip(options.disks, options.radii, strict=True)
@@ -177,12 +178,7 @@ def main(options: Options) -> dict[str, Any]:
     text = write_report(options, cases)
     for case in cases:
         case["timings"] = {n: t.record() for n, t in case["timings"].items()}
-    metrics = {
-        "cases": cases,
-        "options": {k: str(v) for k, v in asdict(options).items() if k != "out"},
-        "environment": report.environment() | {"load": load()},
-        "seconds_total": time.perf_counter() - begin,
-    }
+    metrics = {"cases": cases} | circumstances(options, begin)
     report.write_results(options.out, metrics, text)
     print(text)
     return metrics

@@ -11,7 +11,7 @@ Results are compared before anything is timed. Open3D's ContinuousConv is anothe
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.neighbors import surface, uniform
-from benchmarks.timing import describe, load, measure
+from benchmarks.timing import circumstances, describe, measure
 from ginn_jax import report
 from ginn_jax.commandline import require, start
 from ginn_jax.mcconv import Kernel, init_kernel, mc_conv
@@ -192,12 +192,7 @@ def main(options: Options) -> dict[str, Any]:
     text = write_report(options, cases)
     for case in cases:
         case["timings"] = {n: t.record() for n, t in case["timings"].items()}
-    metrics = {
-        "cases": cases,
-        "options": {k: v for k, v in asdict(options).items() if k != "out"},
-        "environment": report.environment() | {"load": load()},
-        "seconds_total": time.perf_counter() - begin,
-    }
+    metrics = {"cases": cases} | circumstances(options, begin)
     report.write_results(options.out, metrics, text)
     print(text)
     return metrics

@@ -8,7 +8,7 @@ theirs by query; ours do.
 """
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.peers import PEERS, Pairs, Search
-from benchmarks.timing import Timing, describe, load, measure
+from benchmarks.timing import Timing, circumstances, describe, measure
 from ginn_jax import objects, report
 from ginn_jax.commandline import require, start
 from ginn_jax.errors import InputError
@@ -166,10 +166,7 @@ Missing peers: {", ".join(missing) or "none"}.
     metrics = {
         "cases": cases,
         "missing": missing,
-        "options": asdict(options),
-        "environment": report.environment() | {"load": load()},
-        "seconds_total": time.perf_counter() - begin,
-    }
+    } | circumstances(options, begin)
     report.write_results(options.out, metrics, text)
     draw(options.out / "neighbors.png", cases)
     print(text)

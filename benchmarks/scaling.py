@@ -8,7 +8,7 @@ of one scene. Slopes are of the logarithms, fitted over all sizes: 1 is linear.
 """
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.f2d import UNSEEN_SEED, block_memory
-from benchmarks.timing import Timing, describe, load, measure
+from benchmarks.timing import Timing, circumstances, describe, measure
 from ginn_jax import image, lit_scenes, objects, reference, report
 from ginn_jax.architecture import Network, compact_network
 from ginn_jax.camera import orbit_camera
@@ -26,6 +26,9 @@ from ginn_jax.commandline import require, start
 from ginn_jax.geometry import uniform_limits
 from ginn_jax.mesh import sample_surface
 from ginn_jax.train import Training, init_state
+
+# Of the cloud under the frames.
+FRAME_POINTS = 16_000
 
 
 @dataclass(frozen=True)
@@ -81,9 +84,9 @@ def over_points(options: Options, scene: reference.Scene) -> list[dict[str, Any]
 
 def over_pixels(options: Options, scene: reference.Scene) -> list[dict[str, Any]]:
     """f_2D, for frames of each size; its scratch memory is that of a block."""
-    network = network_for(16_000)
+    network = network_for(FRAME_POINTS)
     variables = weights_of(network)
-    cloud = lit_scenes.visible_samples(scene, 16_000, seed=0)
+    cloud = lit_scenes.visible_samples(scene, FRAME_POINTS, seed=0)
     limits = uniform_limits(network, 1 << 17)
     encoded, limits = image.encode_cloud(
         network,
@@ -126,21 +129,12 @@ def main(options: Options) -> dict[str, Any]:
     slopes = {name: slope(rows) for name, rows in tables.items()}
     peak = report.peak_memory_gib()
     text = write_report(options, tables, slopes, peak)
-    report.write_results(
-        options.out,
-        {
-            "tables": {
-                name: [r | {"timing": r["timing"].record()} for r in rows]
-                for name, rows in tables.items()
-            },
-            "slopes": slopes,
-            "peak_memory_gib": peak,
-            "options": {k: v for k, v in asdict(options).items() if k != "out"},
-            "environment": report.environment() | {"load": load()},
-            "seconds_total": time.perf_counter() - begin,
-        },
-        text,
-    )
+    records = {
+        name: [r | {"timing": r["timing"].record()} for r in rows]
+        for name, rows in tables.items()
+    }
+    metrics = {"tables": records, "slopes": slopes, "peak_memory_gib": peak}
+    report.write_results(options.out, metrics | circumstances(options, begin), text)
     draw(options.out / "scaling.png", tables)
     print(text)
     return {"slopes": slopes, "tables": tables}

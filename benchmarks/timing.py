@@ -3,6 +3,7 @@
 import os
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from typing import Any, NamedTuple
 
 import jax
@@ -71,6 +72,16 @@ def clock(call: Callable[[], Any]) -> float:
 def load() -> float:
     """Processes that want a core, averaged over a minute: above 1 others compete."""
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
+
+
+def circumstances(options: Any, begin: float) -> dict[str, Any]:
+    """What every metrics.json has; `begin` is what `time.perf_counter` said then."""
+    return {
+        "options": asdict(options),
+        "environment": environment() | {"load": load()},
+        "machine": describe(),
+        "seconds_total": time.perf_counter() - begin,
+    }
 
 
 def describe() -> str:

@@ -20,14 +20,14 @@ from jax.sharding import PartitionSpec
 from jaxtyping import Array, Key
 from matplotlib.figure import Figure
 
-from benchmarks.timing import Timing, describe, load, measure
+from benchmarks.timing import Timing, circumstances, measure
 from ginn_jax import architecture, fit, objects, report, scenes
 from ginn_jax.commandline import require, start
 from ginn_jax.dataset import ShadedPoints
 from ginn_jax.errors import InputError
 from ginn_jax.geometry import Limits
 from ginn_jax.network import Variables
-from ginn_jax.process import available_cores
+from ginn_jax.process import ALONE, available_cores
 from ginn_jax.train import (
     Training,
     TrainState,
@@ -133,7 +133,8 @@ def stage_call(
         check_vma=False,
     )
     key = jax.random.key(config.seed)
-    return partial(jax.jit(split), fresh.variables, key, batch)
+    call = jax.jit(split, compiler_options=ALONE)
+    return partial(call, fresh.variables, key, batch)
 
 
 def differences(timings: Iterable[Timing]) -> list[float]:
@@ -195,11 +196,7 @@ def main(options: Options) -> dict[str, Any]:
         "geometry_share": max(c["geometry_share"] for c in columns.values()),
         "limits": dict(limits.sizes),
         "training": asdict(config),
-        "options": asdict(options),
-        "environment": report.environment() | {"load": load()},
-        "machine": describe(),
-        "seconds_total": time.perf_counter() - begin,
-    }
+    } | circumstances(options, begin)
     text = write_report(metrics)
     report.write_results(options.out, metrics, text)
     draw(options.out / "train_step.png", columns)

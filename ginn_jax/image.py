@@ -26,7 +26,7 @@ SLACK = 1.25
 
 
 _encode = jax.jit(encode, static_argnums=(0, 1))
-_shade = jax.jit(shade, static_argnums=(0, 1), compiler_options=ALONE)
+shade_block = jax.jit(shade, static_argnums=(0, 1), compiler_options=ALONE)
 _upsample = jax.jit(upsample)
 
 
@@ -114,7 +114,7 @@ def shade_points(
                 for a in (material, light)
             )
             arrays = copies[number % len(copies)]
-            values, demand = _shade(network, flat, *arrays, queries, *numbers)
+            values, demand = shade_block(network, flat, *arrays, queries, *numbers)
             parts.append(values)
             demands.append(demand)
         short: dict[str, int] = {}
@@ -203,7 +203,7 @@ def with_disk_radius(network: Network, radius: float) -> Network:
             f"Poisson radius {radius}: must lie between 0 and the f_2D radius "
             f"{network.query.radius}, or pixels are left without a point"
         )
-    if not radius <= network.levels[1]:
+    if not radius <= min(network.levels[1:], default=radius):
         raise InputError(
             f"Poisson radius {radius} exceeds level 1's {network.levels[1]}"
         )
@@ -213,14 +213,30 @@ def with_disk_radius(network: Network, radius: float) -> Network:
 def limits_at(network: Network, limits: Limits, radius: float) -> Limits:
     """Capacities to expect at another finest Poisson disk radius.
 
-    Points go with the inverse square of the radius, pairs within the finest level with
-    the square of that. A guess: whoever uses it still compares demands.
+    A power of the ratio of the radii squared for each. The powers are measured, at
+    radii .015, .02 and .03 on 20,000 samples of a procedural shape: points go less than
+    with the square, for the samples run out. A guess: whoever uses it still compares
+    demands.
     """
     growth = (network.levels[0] / radius) ** 2
-    power = {"level_0.points": 1, "level_1.candidates": 2, "level_1.edges": 2}
+    powers = {"columns": 0.65, "candidates": -0.3, "words": -0.3, "edges": -1.0}
+    power = {f"level_0.{p}": n for p, n in (powers | {"points": 0.8}).items()}
+    power |= _search_powers("level_1", 0, 0) | {"level_1.points": 0.1}
     for conv in (*network.encoder, network.query):
-        ends = (conv.source == 0) + (conv.target == 0)
-        power |= {f"{conv.name}.{p}": ends for p in ("candidates", "edges", "pairs")}
+        power |= _search_powers(conv.name, conv.source, conv.target)
     return limits_for(
         {name: int(n * growth ** power.get(name, 0)) for name, n in limits.sizes}, 1.0
     )
+
+
+def _search_powers(name: str, source: int, target: int) -> dict[str, float]:
+    """How the demands of a search go with the points of level 0 at its ends."""
+    senders, receivers = float(source == 0), float(target == 0)
+    near = 0.75 * senders + 0.35 * receivers
+    return {
+        f"{name}.columns": 0.25 * receivers,
+        f"{name}.candidates": near,
+        f"{name}.words": near,
+        f"{name}.edges": 0.85 * (senders + receivers),
+        f"{name}.pairs": 1.6 * senders + 0.8 * receivers,
+    }

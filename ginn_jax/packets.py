@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from ginn_jax.voxels import (
+    Expansion,
     VoxelGrid,
     cell_of,
     expand_ranges,
@@ -28,6 +29,7 @@ from ginn_jax.voxels import (
 
 PACKET = 32
 WORD = 32
+TILE = 512
 PairFilter = Callable[[Int[Array, "..."], Int[Array, "..."]], Bool[Array, "..."]]
 
 
@@ -191,36 +193,87 @@ def packet_words(
     `number` are the queries' own numbers, a permutation, if they are not in order.
     """
     lists = -(-near.count // WORD)
-    chunk, _ = expand_ranges(jnp.zeros_like(lists), lists, capacity)
-    packet = chunk.owner
-    first = near.start[packet] + WORD * chunk.row
-    left = jnp.where(chunk.valid, near.count[packet] - WORD * chunk.row, 0)
-    bit = jnp.arange(WORD, dtype=jnp.int32)
-    row = near.row[jnp.minimum(first[:, None] + bit, near.row.size - 1)]
-    point = jnp.where((bit < left[:, None])[..., None], grid.position[row], jnp.nan)
-    lane = jnp.where(mask[:, None], query, jnp.nan).reshape(-1, PACKET, 3)[packet]
-    offset = [lane[:, :, None, axis] - point[:, None, :, axis] for axis in range(3)]
-    hit = offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2 < radius**2
-    if pair_filter is not None:
-        own = packet[:, None] * PACKET + jnp.arange(PACKET, dtype=jnp.int32)
-        hit &= pair_filter(grid.index[row][:, None, :], own[:, :, None])
-    # A sum, so that XLA does not compute a word anew for each edge that looks at it.
-    flags = jnp.uint32(1) << bit.astype(jnp.uint32)
-    word = jnp.sum(jnp.where(hit, flags, jnp.uint32(0)), axis=-1)
-    # The words of a query side by side, so that its edges will be.
-    query_lists = jnp.repeat(lists, PACKET)
+    chunk, total = expand_ranges(jnp.zeros_like(lists), lists, capacity)
+    first = near.start[chunk.owner] + WORD * chunk.row
+    left = jnp.where(chunk.valid, near.count[chunk.owner] - WORD * chunk.row, 0)
+    point, bit = grid.position.T, jnp.arange(WORD, dtype=jnp.int32)
+    lane = jnp.where(mask, query.T, jnp.nan).reshape(3, -1, PACKET)
+
+    def test(*lists: Int[Array, "T"]) -> UInt32[Array, "T 32"]:
+        packet, first, left = lists
+        row = near.row[jnp.minimum(first[:, None] + bit, near.row.size - 1)]
+        real = bit < left[:, None]
+        hit = jnp.float32(0)
+        for axis in range(3):
+            place = jnp.where(real, point[axis][row], jnp.nan)
+            hit += (lane[axis][packet][:, :, None] - place[:, None, :]) ** 2
+        hit = hit < radius**2
+        if pair_filter is not None:
+            own = packet[:, None] * PACKET + jnp.arange(PACKET, dtype=jnp.int32)
+            hit &= pair_filter(grid.index[row][:, None, :], own[:, :, None])
+        # A sum, so that XLA does not compute a word anew for each edge that looks.
+        flags = jnp.uint32(1) << bit.astype(jnp.uint32)
+        return jnp.sum(jnp.where(hit, flags, jnp.uint32(0)), axis=-1)
+
+    word = _in_tiles(test, (chunk.owner, first, left), total)
     if number is None:
-        number = jnp.arange(query_lists.size, dtype=jnp.int32)
-        begin = (prefix_sum(lists) - lists).repeat(PACKET) * PACKET
-        begin += lists.repeat(PACKET) * (number % PACKET)
+        order = _order_in_packets(chunk, lists)
+        number = jnp.arange(query.shape[0], dtype=jnp.int32)
     else:
-        begin = jnp.zeros_like(query_lists).at[number].set(query_lists)
-        begin = (prefix_sum(begin) - begin)[number]
-    place = begin.reshape(-1, PACKET)[packet] + chunk.row[:, None]
-    place = jnp.where(chunk.valid[:, None], place, word.size).reshape(-1)
-    order = jnp.full(word.size, word.size - 1, jnp.int32)
-    order = order.at[place].set(jnp.arange(word.size, dtype=jnp.int32), mode="drop")
-    return Words(word, number.reshape(-1, PACKET)[packet], first, order)
+        order = _order_by_number(chunk, lists, number)
+    return Words(word, number.reshape(-1, PACKET)[chunk.owner], first, order)
+
+
+def _in_tiles(
+    test: Callable[..., UInt32[Array, "T 32"]],
+    lists: tuple[Int[Array, "L"], ...],
+    count: Int[Array, ""],
+) -> UInt32[Array, "L 32"]:
+    """`test` of the first `count` lists, on CPU in tiles that fit a core's cache."""
+    rows = lists[0].shape[0]
+    size = min(TILE, rows) if jax.default_backend() == "cpu" else rows
+
+    def fill(tile: Int[Array, ""], word: UInt32[Array, "L 32"]) -> Array:
+        start = jnp.minimum(tile * size, rows - size)
+        some = [jax.lax.dynamic_slice_in_dim(a, start, size) for a in lists]
+        return jax.lax.dynamic_update_slice_in_dim(word, test(*some), start, axis=0)
+
+    nothing = jnp.zeros((rows, PACKET), jnp.uint32)
+    tiles = (jnp.minimum(count, rows) + size - 1) // size
+    return jax.lax.fori_loop(0, tiles, fill, nothing)
+
+
+def _order_in_packets(chunk: Expansion, lists: Int[Array, "P"]) -> Int[Array, "W"]:
+    """Rows of the words with those of a query side by side, so that its edges will be.
+
+    The words of a packet lie [list, query] and are wanted [query, list].
+    """
+    capacity = chunk.owner.shape[0]
+    begin = prefix_sum(lists) - lists
+    width = jnp.clip(capacity - begin, 1, jnp.maximum(lists, 1))
+    begin, width = (a[chunk.owner][:, None] for a in (begin, width))
+    place = jnp.arange(capacity * PACKET, dtype=jnp.int32).reshape(-1, PACKET)
+    inside = place - begin * PACKET
+    # Integer division is slow; what rounding spoils is put right.
+    query = (inside.astype(jnp.float32) / width.astype(jnp.float32)).astype(jnp.int32)
+    query -= (query * width > inside).astype(jnp.int32)
+    query += ((query + 1) * width <= inside).astype(jnp.int32)
+    order = (begin + inside - query * width) * PACKET + query
+    return jnp.where(chunk.valid[:, None], order, place).reshape(-1)
+
+
+def _order_by_number(
+    chunk: Expansion, lists: Int[Array, "P"], number: Int[Array, "M"]
+) -> Int[Array, "W"]:
+    """The same where queries are numbered otherwise than they lie."""
+    rows = chunk.owner.shape[0] * PACKET
+    query_lists = jnp.repeat(lists, PACKET)
+    begin = jnp.zeros_like(query_lists).at[number].set(query_lists)
+    begin = (prefix_sum(begin) - begin)[number]
+    place = begin.reshape(-1, PACKET)[chunk.owner] + chunk.row[:, None]
+    place = jnp.where(chunk.valid[:, None], place, rows).reshape(-1)
+    order = jnp.full(rows, rows - 1, jnp.int32)
+    return order.at[place].set(jnp.arange(rows, dtype=jnp.int32), mode="drop")
 
 
 def list_bits(

@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-TABLE = (1 << 16) - 1
+# Columns: at most as many as points, but for few points.
+TABLE, FEWEST = (1 << 16) - 1, 1 << 12
 LAYERS = 1 << 15
 FINENESS = 8
 FINE_ENOUGH = 6
@@ -41,8 +42,13 @@ def prefix_sum(counts: Int[Array, "K"]) -> Int[Array, "K"]:
 
 
 def _running_sum(counts: Int[Array, "K"]) -> Int[Array, "K"]:
-    """One sum after the other: on CPU twice as fast as XLA's tree, and one kernel."""
-    return jax.lax.scan(lambda total, n: (total + n,) * 2, jnp.int32(0), counts)[1]
+    """One sum after the other: on CPU five times as fast as XLA's tree.
+
+    Unrolled by 16 or more XLA splits the loop's body, which is fifty times as slow.
+    """
+    return jax.lax.scan(
+        lambda total, n: (total + n,) * 2, jnp.int32(0), counts, unroll=4
+    )[1]
 
 
 def saturating_sum(counts: Int[Array, "..."]) -> Int[Array, ""]:
@@ -56,13 +62,14 @@ def build_grid(
 ) -> VoxelGrid:
     """Sort points into columns `cell` wide; wider where the cloud has too many."""
     origin, extent = _bounds(position, mask)
-    size = _cell_size(extent, cell)
+    table = min(max(position.shape[0], FEWEST), TABLE)
+    size = _cell_size(extent, cell, table)
     shape = jnp.floor(extent / size).astype(jnp.int32) + 1
     x, y, layer = jnp.floor((position - origin) / size).astype(jnp.int32).T
-    column = jnp.where(mask, x * shape[1] + y, TABLE).astype(jnp.uint32)
+    column = jnp.where(mask, x * shape[1] + y, table).astype(jnp.uint32)
     order = stable_order(jnp.where(mask, layer, 0).astype(jnp.uint32), 16)
     order = order[stable_order(column[order], 16)]
-    count = jnp.zeros(TABLE, jnp.int32).at[column].add(1, mode="drop")
+    count = jnp.zeros(table, jnp.int32).at[column].add(1, mode="drop")
     start = jnp.concatenate([jnp.zeros(1, jnp.int32), prefix_sum(count)])
     return VoxelGrid(position[order], order, layer[order], start, origin, size, shape)
 
@@ -114,15 +121,17 @@ def _bounds(
     return jnp.where(occupied, low, 0.0), jnp.where(occupied, high - low, 0.0)
 
 
-def _cell_size(extent: Float[Array, "3"], cell: Float[Array, ""]) -> Float[Array, "3"]:
+def _cell_size(
+    extent: Float[Array, "3"], cell: Float[Array, ""], table: int
+) -> Float[Array, "3"]:
     """`cell` across x and y, finer along z, unless the tables would not hold them."""
     width, depth, height = extent
     across = jnp.max(
         jnp.stack(
             [
                 cell,
-                2.01 * jnp.sqrt(width / TABLE) * jnp.sqrt(depth),
-                4.01 * jnp.maximum(width, depth) / TABLE,
+                2.01 * jnp.sqrt(width / table) * jnp.sqrt(depth),
+                4.01 * jnp.maximum(width, depth) / table,
             ]
         )
     )

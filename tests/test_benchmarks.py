@@ -1,8 +1,12 @@
 """The benchmarks run and say what they should; how long things take is not tested."""
 
 import json
+from dataclasses import replace
+from functools import partial
+from inspect import unwrap
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny
@@ -16,10 +20,9 @@ from benchmarks import (
     timing,
     train_step,
 )
-from ginn_jax import architecture
+from ginn_jax import architecture, image
 from ginn_jax.commandline import hasten
 from ginn_jax.errors import InputError
-from ginn_jax.geometry import uniform_limits
 
 
 def test_measure_alternates_and_keeps_order():
@@ -106,16 +109,18 @@ def test_neighbors_stops_at_a_search_that_is_wrong(tmp_path, monkeypatch):
 
 
 def test_train_step(tmp_path, monkeypatch):
-    monkeypatch.setitem(architecture.PRESETS, "default", tiny.NETWORK)
-    limits = uniform_limits(tiny.NETWORK, 1 << 15)
+    stand_in(monkeypatch)
+    monkeypatch.setitem(architecture.PRESETS, "default", tiny.ONE_LEVEL)
+    limits = tiny.ONE_LEVEL_LIMITS
     monkeypatch.setattr("ginn_jax.fit.training_limits", lambda *_: limits)
     options = train_step.Options(
         tmp_path, shapes=1, batch=1, points=600, queries=64, repeats=1
     )
-    stages = ("levels", "edges", "geometry", "step")
+    stages = ("geometry", "step")
     some = {name: train_step.STAGES[name] for name in stages}
     monkeypatch.setattr(train_step, "STAGES", some)
-    with jax.numpy_dtype_promotion("standard"):
+    monkeypatch.setattr(train_step, "train_step", step_of_ones(train_step.train_step))
+    with jax.numpy_dtype_promotion("standard"), tiny.cheap_compiling():
         metrics = train_step.main(options)
     share = metrics["columns"]["one device's share"]
     assert list(share["added"]) == list(stages)
@@ -124,13 +129,31 @@ def test_train_step(tmp_path, monkeypatch):
     check_files(tmp_path, "train_step.png")
 
 
-@pytest.mark.parametrize("stage", ["forward", "gradient"])
-def test_later_stages_of_the_step(stage):
+def step_of_ones(step):
+    """The step's shapes without its compilation: it has tests of its own."""
+
+    def traced(config, limits, *arrays):
+        shapes = jax.eval_shape(partial(unwrap(step), config, limits), *arrays)
+        return jax.tree.map(lambda s: jnp.ones(s.shape, s.dtype), shapes)
+
+    return traced
+
+
+@pytest.mark.parametrize("stage", ["levels", "edges", "forward", "gradient"])
+def test_stages_of_the_step(stage):
     """Traced only: compiling them takes long and adds nothing."""
-    setting = tiny.CONFIG, tiny.LIMITS, stage, tiny.fresh_state(), tiny.batch()
-    (first, _), demands = jax.eval_shape(train_step.stage_call(*setting))
-    assert set(demands) == set(dict(tiny.LIMITS.sizes))
-    assert isinstance(first, tuple) == (stage == "gradient")
+    config = replace(tiny.CONFIG, network=tiny.ONE_LEVEL)
+    setting = config, tiny.ONE_LEVEL_LIMITS, stage, untrained(config), tiny.batch()
+    call = train_step.stage_call(*setting)
+    first, second = call.func.eval_shape(*call.args)
+    rows = tiny.ONE_LEVEL_LIMITS.sizes[0][1]
+    if stage == "levels":
+        assert first[0].position.shape == (1, rows, 3)
+    elif stage == "edges":
+        assert [edges[0].shape for edges in (first, second)] == [(1, rows)] * 2
+    else:
+        assert set(second) == set(dict(tiny.ONE_LEVEL_LIMITS.sizes))
+        assert isinstance(first[0], tuple) == (stage == "gradient")
 
 
 @pytest.mark.parametrize("trained", [False, True])
@@ -150,7 +173,8 @@ def test_poisson_radii(tmp_path, monkeypatch, trained):
         rays=4,
         repeats=1,
     )
-    metrics = poisson_radii.main(options)
+    with tiny.cheap_compiling():
+        metrics = poisson_radii.main(options)
     assert metrics["occlusion_radius"] == (0.2 if trained else 0.1)
     assert [row["radius"] for row in metrics["rows"]] == [0.08]
     assert 0 < metrics["rows"][0]["points"] < 1200
@@ -162,10 +186,16 @@ def test_poisson_radii(tmp_path, monkeypatch, trained):
 
 def test_f2d(tmp_path, monkeypatch):
     """Ours and the straightforward form agree, or `compare` raises."""
-    monkeypatch.setattr(f2d, "compact_network", lambda **_: tiny.NETWORK)
-    monkeypatch.setattr(f2d, "uniform_limits", lambda *_: tiny.LIMITS)
+    stand_in(monkeypatch)
+    monkeypatch.setattr(f2d, "compact_network", lambda **_: tiny.ONE_LEVEL)
     options = f2d.Options(
-        tmp_path, resolution=48, disks=(0.08,), radii=(0.16,), rays=(1,), repeats=1
+        tmp_path,
+        resolution=48,
+        points=700,
+        disks=(0.08,),
+        radii=(0.16,),
+        rays=(1,),
+        repeats=1,
     )
     with tiny.cheap_compiling():
         case = f2d.main(options)["cases"][0]
@@ -212,7 +242,9 @@ def test_mc_conv_compares_with_a_peer():
 
 
 def test_scaling(tmp_path, monkeypatch):
-    monkeypatch.setattr(scaling, "network_for", lambda _: tiny.NETWORK)
+    stand_in(monkeypatch)
+    monkeypatch.setattr(scaling, "network_for", lambda _: tiny.ONE_LEVEL)
+    monkeypatch.setattr(scaling, "FRAME_POINTS", 700)
     options = scaling.Options(
         tmp_path, points=(600, 700), resolutions=(32, 64), repeats=1
     )
@@ -244,9 +276,19 @@ def test_mistakes_are_input_errors(tmp_path, monkeypatch):
 
 
 def stand_in(monkeypatch):
-    """A network that compiles in seconds, and its untrained weights."""
+    """Networks that compile in seconds, untrained, with limits that suffice at once."""
     monkeypatch.setattr(architecture, "DEFAULT", tiny.NETWORK)
-    monkeypatch.setattr(poisson_radii, "init_state", lambda *_: tiny.fresh_state())
+    for module in (f2d, poisson_radii, scaling, train_step):
+        monkeypatch.setattr(module, "init_state", untrained)
+    for module in (f2d, scaling):
+        monkeypatch.setattr(module, "uniform_limits", lambda *_: tiny.ONE_LEVEL_LIMITS)
+    # Every frame has full blocks, so one shape is compiled.
+    monkeypatch.setattr(image, "BLOCK", 256)
+
+
+def untrained(config):
+    """The first state of a network, compiled once for all tests."""
+    return tiny.fresh_state(replace(tiny.CONFIG, network=config.network))
 
 
 def check_files(folder, figure):

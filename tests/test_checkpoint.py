@@ -177,3 +177,43 @@ def test_undecodable_record_is_refused(recorded):
     (recorded / "run.json").write_bytes(b"\xff\xfe\x00{")
     with pytest.raises(InputError, match=r"run\.json is damaged"):
         checkpoint.load_run(recorded, tiny.CONFIG, EXTRA)
+
+
+def test_weights_of_a_run_come_back(third, saved, tmp_path):
+    """With nothing but the folder: the configuration is read as well."""
+    shutil.copytree(saved, tmp_path, dirs_exist_ok=True)
+    checkpoint.save_run(tmp_path, tiny.CONFIG, tiny.LIMITS, EXTRA)
+    config, limits, variables = checkpoint.load_weights(tmp_path)
+    assert config == tiny.CONFIG
+    assert hash(config) == hash(tiny.CONFIG)
+    assert dict(limits.sizes) == dict(tiny.LIMITS.sizes)
+    assert tiny.identical(jax.tree.map(np.array, variables), third.variables)
+    assert all(len(a.devices()) == 1 for a in jax.tree.leaves(variables))
+
+
+def test_no_run_has_no_weights(tmp_path):
+    with pytest.raises(InputError, match=r"^[^\n]*holds no run: name[^\n]*$"):
+        checkpoint.load_weights(tmp_path)
+
+
+def test_a_run_without_a_checkpoint_has_no_weights(recorded):
+    with pytest.raises(InputError, match=r"^[^\n]*no checkpoint yet[^\n]*$"):
+        checkpoint.load_weights(recorded)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"training": 3}, {"limits": {"a": None}}, {"training": {"steps": 3}}],
+)
+def test_weights_of_a_damaged_record_are_refused(recorded, change):
+    path = recorded / "run.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(InputError, match=r"^[^\n]*run\.json is damaged[^\n]*$"):
+        checkpoint.load_weights(recorded)
+
+
+def test_weights_of_another_version_are_refused(recorded):
+    path = recorded / "run.json"
+    path.write_text(path.read_text().replace('"level_0.words"', '"level_0.buckets"'))
+    with pytest.raises(InputError, match=r"another version"):
+        checkpoint.load_weights(recorded)

@@ -3,9 +3,10 @@ import pytest
 import tiny
 import trimesh
 
-from ginn_jax import objects, scenes
+from ginn_jax import lit_scenes, objects, scenes
 from ginn_jax.dataset import load_cloud
 from ginn_jax.errors import InputError
+from ginn_jax.reference import build_scene
 from ginn_jax.shapes import random_shape
 
 SETTINGS = scenes.Occlusion(points=300, rays=4, radius=0.2)
@@ -134,3 +135,32 @@ def test_missing_mesh_is_refused(tmp_path):
 def test_missing_clouds_are_refused(sources, tmp_path):
     with pytest.raises(InputError, match="crate"):
         scenes.read_clouds(sources, SETTINGS, tmp_path)
+
+
+def nested_boxes(path, sides):
+    """A scene of cubes one inside the other, the outermost of side 1."""
+    cubes = [trimesh.creation.box((side,) * 3) for side in sides]
+    trimesh.util.concatenate(cubes).export(path)
+    return build_scene(objects.load_object(objects.file_sources([path])[0]))
+
+
+def test_visible_samples_are_of_the_outside_only(tmp_path):
+    """The inner cube has as much as 49 parts in 100 of the area of the outer one."""
+    scene = nested_boxes(tmp_path / "two.ply", (1.0, 0.7))
+    samples = lit_scenes.visible_samples(scene, 2000, seed=3)
+    assert samples.position.shape == samples.normal.shape == (2000, 3)
+    assert len(samples.material) == 2000
+    cube = np.flatnonzero(samples.material == 0)
+    centred = np.abs(samples.position[cube]).max(axis=1)
+    np.testing.assert_allclose(centred, 0.5, atol=1e-5)
+    # The five sides off the ground have alike many.
+    side = np.argmax(np.abs(samples.normal[cube]), axis=1) * 2
+    side += samples.normal[cube, side // 2] > 0
+    free = np.delete(np.bincount(side, minlength=6), 2)
+    assert free.min() > 0.8 * free.mean()
+
+
+def test_a_scene_that_is_sealed_is_refused(tmp_path):
+    scene = nested_boxes(tmp_path / "many.ply", np.linspace(1, 0.9, 200))
+    with pytest.raises(InputError, match=r"^[^\n]*sealed[^\n]*$"):
+        lit_scenes.visible_samples(scene, 100, seed=0)

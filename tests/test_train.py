@@ -15,12 +15,8 @@ import pytest
 import tiny
 
 from ginn_jax import example, train
-from ginn_jax.architecture import compact_network
-from ginn_jax.geometry import Geometry, exceeded, uniform_limits
+from ginn_jax.geometry import Geometry, exceeded
 from ginn_jax.receptive_field import Oriented
-
-ONE_LEVEL = compact_network(k=2, levels=(0.08,), query_radius=0.16, latent=2)
-ONE_LEVEL_LIMITS = uniform_limits(ONE_LEVEL, 32768)
 
 
 def run(state, steps, data=None):
@@ -151,8 +147,8 @@ assert len(jax.devices()) == 2
 assert train.batch_mesh(2).size == train.batch_mesh(4).size == 2
 assert train.batch_mesh(3).size == 1
 import test_train, tiny
-config = replace(tiny.CONFIG, network=test_train.ONE_LEVEL)
-limits = test_train.ONE_LEVEL_LIMITS
+config = replace(tiny.CONFIG, network=tiny.ONE_LEVEL)
+limits = tiny.ONE_LEVEL_LIMITS
 test_train.check_loss_of_zero_network(config, limits)
 state, data = tiny.fresh_state(config, limits), tiny.batch()
 for _ in range(2):
@@ -248,8 +244,8 @@ def test_left_over_points_carry_the_loss():
 
 
 def test_queries_lie_beside_the_finest_level():
-    config = replace(tiny.CONFIG, network=ONE_LEVEL, queries=100)
-    build = partial(train.make_example, config, ONE_LEVEL_LIMITS)
+    config = replace(tiny.CONFIG, network=tiny.ONE_LEVEL, queries=100)
+    build = partial(train.make_example, config, tiny.ONE_LEVEL_LIMITS)
     with tiny.cheap_compiling():
         made, _ = jax.jit(build)(tiny.batch(), key=jax.random.key(3))
     queries, level = made.queries, made.geometry.levels[0]
