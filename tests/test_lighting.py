@@ -317,3 +317,13 @@ def test_below_the_horizon_lies_ground_of_its_albedo():
     np.testing.assert_array_equal(ground, np.broadcast_to(ground[0, 0], ground.shape))
     arrives = irradiance_of(EnvironmentMap(light), unit(0, 1, 0))
     np.testing.assert_allclose(ground[0, 0], 0.3 * arrives / np.pi, rtol=1e-3)
+
+
+def test_sky_is_all_above_the_horizon():
+    """All around, in the lowest row too; and without a sun as bright on both sides."""
+    sky = sun_and_sky(4.0, unit(1, 1, 0), sun_scale=0.0).radiance
+    upper = sky[: lighting.HEIGHT // 2]
+    assert upper.min() > 0.01 * upper.max()
+    # Mirrored in the plane of the sun, z = 0: direction phi against pi - phi.
+    mirrored = upper[:, (lighting.HEIGHT - 1 - np.arange(512)) % 512]
+    np.testing.assert_allclose(mirrored, upper, rtol=1e-3)
