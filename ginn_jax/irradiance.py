@@ -46,7 +46,9 @@ def light_scene(mesh: Mesh, albedo: Float[np.ndarray, "K 3"], light: Light) -> L
     if not (albedo <= 1).all():
         raise InputError("an albedo above 1 would make light: give it in [0, 1]")
     if mesh.material.max() >= len(albedo):
-        raise InputError(f"the mesh has materials up to {mesh.material.max()}")
+        raise InputError(
+            f"{len(albedo)} albedos for materials up to {mesh.material.max()}: give all"
+        )
     mi, variant = use_mitsuba()
     with mi.variant_context(variant):
         parts: dict[str, Any] = {"type": "scene", "light": emitter(light)}
@@ -98,6 +100,7 @@ def direct_irradiance(
     radiance from a lattice that is shifted at random; one is enough for a point light.
     """
     check_points(points, normals)
+    check_draws("samples", samples, seed)
     samples = samples if isinstance(scene.light, EnvironmentMap) else 1
     size = max(1, min(PATHS_PER_LAUNCH // samples, len(points)))
     parts = [
@@ -122,11 +125,12 @@ def _direct(
         point, ray, at, normal = _lanes(scene, points, normals, samples)
         number = point + dr.opaque(mi.UInt32, first)
         shift = random_pair(number, mi.UInt32(0), dr.opaque(mi.UInt32, seed))
+        # In words, whose multiples wrap around and stay exact however many they are.
         square = [
-            mi.Float(s >> 8) * 2**-24 + mi.Float(ray) * step
+            mi.Float((s + ray * int(step * 2**32)) >> 8) * 2**-24
             for s, step in zip(shift, LATTICE, strict=True)
         ]
-        square = mi.Point2f(*(x - dr.floor(x) for x in square))
+        square = mi.Point2f(*square)
         receiver = dr.zeros(mi.SurfaceInteraction3f, len(points) * samples)
         receiver.p, receiver.n = at, normal
         toward, radiance = scene.handle.sample_emitter_direction(receiver, square)
@@ -151,13 +155,24 @@ def indirect_irradiance(
     section "Training Data Generation"); Mitsuba's `path` with hidden emitters.
     """
     check_points(points, normals)
+    check_draws("paths", paths, seed)
     size = max(1, min(PATHS_PER_LAUNCH // paths, len(points)))
     parts = [
         _indirect(scene, points[i : i + size], normals[i : i + size], i, paths, seed)
         for i in range(0, len(points), size)
     ]
-    mean, variance = (np.concatenate(c) for c in zip(*parts, strict=True))
+    nothing = np.zeros((0, 3), np.float32)
+    mean = np.concatenate([nothing, *(part.mean for part in parts)])
+    variance = np.concatenate([nothing, *(part.variance for part in parts)])
     return ColorEstimate(mean, variance)
+
+
+def check_draws(name: str, count: int, seed: int) -> None:
+    """Raise `InputError` unless so many random draws a point can be made."""
+    if not 1 <= count <= PATHS_PER_LAUNCH:
+        raise InputError(f"{name} {count} must be from 1 to {PATHS_PER_LAUNCH}")
+    if not 0 <= seed < 2**32:
+        raise InputError(f"seed {seed} must be from 0 to 2**32 - 1")
 
 
 def _indirect(

@@ -85,11 +85,21 @@ def make_environment(radiance: Float[np.ndarray, "H W 3"]) -> EnvironmentMap:
         raise InputError("radiance is negative; clip it at zero")
     if radiance.max() == 0:
         raise InputError("radiance is zero everywhere: the map is empty")
-    factor = max(radiance.shape[0] // HEIGHT, 1)
-    height, width = (n // factor for n in radiance.shape[:2])
-    part = radiance[: height * factor, : width * factor].astype(np.float64)
-    part = part.reshape(height, factor, width, factor, 3).mean(axis=(1, 3))
-    return EnvironmentMap(part.astype(np.float32))
+    height, width = radiance.shape[:2]
+    if height > HEIGHT:
+        rows = _averaging(height, HEIGHT)
+        columns = _averaging(width, max(round(width * HEIGHT / height), 1))
+        radiance = np.einsum("iu,ujc->ijc", rows, radiance, optimize=True)
+        radiance = np.einsum("jv,ivc->ijc", columns, radiance, optimize=True)
+    return EnvironmentMap(radiance.astype(np.float32))
+
+
+def _averaging(many: int, few: int) -> Float[np.ndarray, "few many"]:
+    """The shares that `many` equal parts of a length have in each of `few`."""
+    edges, start = np.linspace(0, many, few + 1), np.arange(many)
+    ends = np.minimum(edges[1:, None], start + 1)
+    shared = ends - np.maximum(edges[:-1, None], start)
+    return np.maximum(shared, 0) * few / many
 
 
 def constant_sky(radiance: float = 1.0) -> EnvironmentMap:
@@ -126,7 +136,8 @@ def sun_and_sky(
     sky = make_environment(np.nan_to_num(np.maximum(values, 0.0)))
     below = pixel_directions(HEIGHT)[..., 1] < 0
     bounced = EARTH * irradiance_of(sky, np.array([0.0, 1.0, 0.0])) / np.pi
-    return EnvironmentMap(np.where(below[..., None], bounced, sky.radiance))
+    radiance = np.where(below[..., None], bounced, sky.radiance)
+    return EnvironmentMap(radiance.astype(np.float32))
 
 
 def studio(seed: int) -> EnvironmentMap:

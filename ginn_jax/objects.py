@@ -98,7 +98,7 @@ def file_sources(paths: Sequence[Path]) -> list[Source]:
 
 def tell_apart(paths: Sequence[Path]) -> list[str]:
     """The shortest ends of the paths, of one length, that are all different."""
-    parts = [[*path.parent.parts[1:], path.stem] for path in paths]
+    parts = [p.relative_to(p.anchor).with_suffix("").parts for p in paths]
     for length in range(1, max((len(p) for p in parts), default=1) + 1):
         names = ["_".join(p[-length:]) for p in parts]
         if len(set(names)) == len(names):

@@ -79,17 +79,14 @@ def subsurface_exitance(
 
 def _check_medium(medium: Medium, paths: int, seed: int) -> None:
     """Raise `InputError` unless walks can be made in it."""
-    albedo, most = np.asarray(medium.albedo), irradiance.PATHS_PER_LAUNCH
+    albedo = np.asarray(medium.albedo)
     if albedo.shape != (3,) or not ((albedo >= 0) & (albedo <= 1)).all():
         raise InputError(f"albedo {albedo} must be three numbers in [0, 1]")
     if not 0 <= medium.extinction < np.inf:
         raise InputError(f"extinction {medium.extinction} must be finite, not negative")
     if not 1 <= medium.ior <= 2:
         raise InputError(f"index of refraction {medium.ior} must be from 1 to 2")
-    if not 1 <= paths <= most:
-        raise InputError(f"paths {paths} must be from 1 to {most}")
-    if not 0 <= seed < 2**32:
-        raise InputError(f"seed {seed} must be from 0 to 2**32 - 1")
+    irradiance.check_draws("paths", paths, seed)
 
 
 def _exitance(

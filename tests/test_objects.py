@@ -1,0 +1,313 @@
+"""Which objects and lights there are, what they are called, and who meets whom."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import SEEDS
+
+from ginn_jax import lighting, objects
+from ginn_jax.errors import InputError
+from ginn_jax.lighting import EnvironmentMap, PointLight
+from ginn_jax.mesh import find_meshes
+from ginn_jax.objects import (
+    PAPER_SPLIT,
+    Source,
+    file_lights,
+    file_sources,
+    load_light,
+    load_object,
+    origin_of,
+    pair_up,
+    point_lights,
+    procedural_lights,
+    procedural_sources,
+    random_point_light,
+    shape_seed,
+    split_apart,
+    tell_apart,
+)
+from ginn_jax.renderer import use_mitsuba
+
+WORD = st.text("ab_0", min_size=1, max_size=3)
+PATHS = st.lists(
+    st.tuples(st.lists(WORD, max_size=4), WORD, st.sampled_from([".obj", ".ply"])),
+    max_size=12,
+    unique_by=str,
+)
+SHAPENET = [
+    f"{synset}/{model}/models/model_normalized.obj"
+    for synset in ("02691156", "03001627")
+    for model in ("1a04e3ea", "1a6ad7a2", "1b171503")
+]
+SHREC = [f"{i}.obj" for i in (0, 1, 2, 10, 11)]
+
+
+def boxes(folder, names):
+    """A box for each name, each with a side of its own: 1 + its number."""
+    for i, name in enumerate(names):
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        trimesh.creation.box((1.0, 1.0, 1.0 + i)).export(path)
+    return folder
+
+
+def sky_file(path, radiance=1.0):
+    rng = np.random.default_rng(0)
+    pixels = radiance * rng.uniform(0, 1, (8, 16, 3)).astype(np.float32)
+    use_mitsuba()[0].Bitmap(pixels).write(str(path))
+    return path
+
+
+# Names
+
+
+@pytest.mark.parametrize("names", [SHAPENET, SHREC])
+def test_objects_of_a_dataset_load_under_names_of_their_own(tmp_path, names):
+    sources = file_sources(find_meshes(boxes(tmp_path, names)))
+    assert len({s.name for s in sources}) == len(sources) == len(names)
+    assert not any("/" in s.name for s in sources)
+    for source in sources:
+        place = names.index(str(Path(source.path).relative_to(tmp_path)))
+        mesh = load_object(source)
+        sides = np.ptp(mesh.vertices[np.unique(mesh.faces[mesh.material == 0])], axis=0)
+        np.testing.assert_allclose(sorted(sides)[0], 1 / (1 + place), rtol=1e-5)
+        assert (mesh.material == 1).sum() == 2
+        assert not (load_object(source, ground=False).material == 1).any()
+
+
+def test_names_are_those_of_the_datasets():
+    names = tell_apart([Path("/data") / name for name in SHREC])
+    assert names == ["0", "1", "2", "10", "11"]
+    names = tell_apart([Path("/data") / name for name in SHAPENET])
+    assert names[0] == "02691156_1a04e3ea_models_model_normalized"
+    names = tell_apart([Path("/data") / name for name in SHAPENET[:3]])
+    assert names[0] == "1a04e3ea_models_model_normalized"
+
+
+@pytest.mark.parametrize("root", ["/", "/data", "", "..", "a"])
+@given(PATHS)
+def test_no_two_paths_have_one_name(root, drawn):
+    paths = [Path(root, *folders, stem + ending) for folders, stem, ending in drawn]
+    names = tell_apart(paths)
+    assert len(set(names)) == len(names) == len(paths)
+    assert not any("/" in name for name in names)
+
+
+def test_folders_of_relative_paths_tell_apart():
+    """All of them, so that the names do not depend on the order."""
+    paths = [Path("one/thing.obj"), Path("two/thing.obj")]
+    assert tell_apart(paths) == ["one_thing", "two_thing"]
+    assert tell_apart(paths[::-1]) == ["two_thing", "one_thing"]
+
+
+def test_same_name_with_other_endings_is_numbered():
+    assert tell_apart([Path("/a/b.obj"), Path("/a/b.ply")]) == ["0_b", "1_b"]
+
+
+# Splits
+
+
+@given(
+    st.lists(st.integers(0, 9), max_size=4), st.integers(0, 5), st.integers(0, 2**31)
+)
+def test_parts_are_disjoint_and_as_large_as_asked(counts, more, seed):
+    items = [f"item {i}" for i in range(sum(counts) + more)]
+    parts = split_apart(items, counts, seed)
+    assert [len(p) for p in parts] == counts
+    together = [item for part in parts for item in part]
+    assert len(set(together)) == len(together) == sum(counts)
+    assert set(together) <= set(items)
+    assert split_apart(items, counts, seed) == parts
+
+
+def test_seed_decides_the_parts():
+    items = list(range(100))
+    parts = [tuple(split_apart(items, [60, 40], seed)[0]) for seed in range(5)]
+    assert len(set(parts)) == 5
+    assert all(p == tuple(sorted(p)) for p in parts)
+    # Of many splits, every item is in each part.
+    ever = {i for seed in range(30) for i in split_apart(items, [20], seed)[0]}
+    assert len(ever) > 95
+
+
+@given(st.lists(st.integers(1, 9), min_size=1, max_size=4), SEEDS)
+def test_too_few_are_refused(counts, seed):
+    with pytest.raises(InputError, match=f"needs {sum(counts)}") as caught:
+        split_apart(list(range(sum(counts) - 1)), counts, seed)
+    assert "\n" not in str(caught.value)
+
+
+def test_paper_split():
+    """Objects and lights of each, 20 k points and 4096 rays."""
+    assert PAPER_SPLIT.train == (1000, 20)
+    assert PAPER_SPLIT.validation == (200, 5)
+    assert PAPER_SPLIT.test == (500, 5)
+    assert PAPER_SPLIT.points == 20_000
+    assert PAPER_SPLIT.paths == 4096
+
+
+# Pairs
+
+LIGHTS = {"sky": procedural_lights, "point": point_lights}
+
+
+@given(
+    st.integers(0, 12),
+    st.integers(1, 9),
+    st.integers(1, 6),
+    st.sampled_from(sorted(LIGHTS)),
+    st.booleans(),
+)
+def test_every_object_has_lights_and_every_light_objects(
+    count, some, each, kind, files
+):
+    if files:
+        things = file_sources([Path(f"/data/{i}.obj") for i in range(count)])
+    else:
+        things = procedural_sources(count, 100)
+    lights = LIGHTS[kind](some, 50)
+    pairs = pair_up(things, lights, each)
+    each = min(each, some)
+    assert len(pairs) == count * each
+    assert len({p.name for p in pairs}) == len(pairs)
+    assert len({p.seed for p in pairs}) == len(pairs)
+    for thing, start in zip(things, range(0, len(pairs), each), strict=True):
+        mine = pairs[start : start + each]
+        assert len({p.light for p in mine}) == each
+        assert {p.path for p in mine} == {thing.path}
+        assert all(p.name.startswith(f"{thing.name}__") for p in mine)
+    used = [p.light for p in pairs]
+    assert len(set(used)) == min(len(pairs), some)
+    most = [used.count(light) for light in lights]
+    assert max(most) - min(most) <= 1
+
+
+def test_no_lights_are_refused():
+    with pytest.raises(InputError, match="no lights"):
+        pair_up(procedural_sources(2, 0), [], 3)
+
+
+@given(SEEDS, st.integers(1, 5))
+def test_shape_has_its_seed_under_any_light(seed, each):
+    [alone] = procedural_sources(1, seed)
+    pairs = pair_up([alone], procedural_lights(5, 7), each)
+    assert shape_seed(alone) == seed
+    assert {shape_seed(p) for p in pairs} == {seed}
+
+
+def test_procedural_object_keeps_its_shape_under_any_light():
+    [alone] = procedural_sources(1, 5)
+    before = load_object(alone)
+    for pair in pair_up([alone], procedural_lights(3, 0) + point_lights(1, 0), 4):
+        mesh = load_object(pair)
+        np.testing.assert_array_equal(mesh.vertices, before.vertices)
+        np.testing.assert_array_equal(mesh.faces, before.faces)
+
+
+# Lights
+
+
+def test_each_kind_of_light_loads(tmp_path, monkeypatch):
+    monkeypatch.setattr(lighting, "HEIGHT", 16)
+    lights = [
+        *file_lights([sky_file(tmp_path / "sky.exr")]),
+        *procedural_lights(1, 3),
+        *point_lights(1, 3),
+    ]
+    assert len({light.name for light in lights}) == 3
+    [thing] = procedural_sources(1, 0)
+    file, sky, point = (load_light(s) for s in pair_up([thing], lights, 3))
+    assert isinstance(file, EnvironmentMap)
+    assert isinstance(sky, EnvironmentMap)
+    assert isinstance(point, PointLight)
+
+
+def test_light_from_a_file_is_turned_by_the_seed(tmp_path):
+    """About the vertical: each row keeps its pixels, in turn."""
+    path = sky_file(tmp_path / "sky.exr")
+    plain = lighting.load_environment(path).radiance
+    [light] = file_lights([path])
+    columns = set()
+    for seed in range(20):
+        source = Source("thing", None, seed, light)
+        found = load_light(source).radiance
+        rolls = [(np.roll(plain, c, axis=1) == found).all() for c in range(16)]
+        assert sum(rolls) == 1
+        columns.add(rolls.index(True))
+        np.testing.assert_array_equal(load_light(source).radiance, found)
+    assert len(columns) > 6
+
+
+def test_object_without_light_has_none():
+    with pytest.raises(InputError, match=r"^[^\n]*shape_4: no light[^\n]*$"):
+        load_light(procedural_sources(1, 4)[0])
+
+
+@given(SEEDS)
+def test_point_light_is_above_and_out_of_the_unit_box(seed):
+    light = random_point_light(seed)
+    x, y, z = light.position
+    assert 0.5 < y < 2
+    assert np.hypot(x, z) > 0.5 * np.sqrt(2)
+    assert (light.intensity > 0).all()
+    again = random_point_light(seed)
+    np.testing.assert_array_equal(light.position, again.position)
+
+
+def test_point_lights_differ():
+    places = np.array([random_point_light(s).position for s in range(20)])
+    assert len(np.unique(places, axis=0)) == 20
+    assert np.abs(places[:, [0, 2]].mean(0)).max() < 0.8
+
+
+# Origins
+
+
+def test_origin_knows_the_contents_of_files(tmp_path):
+    sky, thing = sky_file(tmp_path / "sky.exr"), tmp_path / "box.ply"
+    trimesh.creation.box((1, 1, 1)).export(thing)
+    [pair] = pair_up(file_sources([thing]), file_lights([sky]), 1)
+    first = origin_of(pair)
+    assert origin_of(pair) == first
+    sky_file(sky, 2.0)
+    second = origin_of(pair)
+    assert second != first
+    assert second["object"] == first["object"]
+    trimesh.creation.box((1, 1, 2)).export(thing)
+    third = origin_of(pair)
+    assert third != second
+    assert third["light"] == second["light"]
+    # Files that were moved are the same.
+    moved = sky.rename(tmp_path / "elsewhere.exr")
+    [pair] = pair_up(file_sources([thing]), file_lights([moved]), 1)
+    assert origin_of(pair) == third
+
+
+def test_origins_of_seeds_differ():
+    things, lights = procedural_sources(3, 0), procedural_lights(2, 0)
+    pairs = pair_up(things, lights + point_lights(2, 0), 4)
+    found = [str(sorted(origin_of(p).items())) for p in [*things, *pairs]]
+    assert len(set(found)) == len(found) == 15
+
+
+@pytest.mark.parametrize("gone", ["object", "light"])
+def test_origin_of_a_missing_file_is_refused(tmp_path, gone):
+    sky, thing = sky_file(tmp_path / "sky.exr"), tmp_path / "box.ply"
+    trimesh.creation.box((1, 1, 1)).export(thing)
+    [pair] = pair_up(file_sources([thing]), file_lights([sky]), 1)
+    missing = {"object": thing, "light": sky}[gone]
+    missing.unlink()
+    with pytest.raises(InputError) as caught:
+        origin_of(pair)
+    assert str(missing) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_environment_is_refused_on_loading(tmp_path):
+    [light] = file_lights([tmp_path / "gone.hdr"])
+    with pytest.raises(InputError, match=r"^[^\n]*gone\.hdr[^\n]*$"):
+        load_light(objects.Source("thing", None, 0, light))
