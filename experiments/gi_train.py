@@ -23,8 +23,8 @@ class Options(LitOptions):
 
     out: Path = Path("runs/gi_train")
     """Folder for data, checkpoints, metrics.json, report.md and figures."""
-    preset: Literal["linear", "homogeneous", "released"] = "linear"
-    """Exactly linear in light, homogeneous in it, or the authors' released table."""
+    preset: Literal["homogeneous", "linear", "released"] = "homogeneous"
+    """Homogeneous in light, exactly linear in it, or the authors' released table."""
 
 
 def main(options: Options) -> dict[str, Any]:

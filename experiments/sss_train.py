@@ -24,8 +24,8 @@ class Options(LitOptions):
 
     out: Path = Path("runs/sss_train")
     """Folder for data, checkpoints, metrics.json, report.md and figures."""
-    preset: Literal["linear", "homogeneous", "released"] = "linear"
-    """Exactly linear in light, homogeneous in it, or the authors' released table."""
+    preset: Literal["homogeneous", "linear", "released"] = "homogeneous"
+    """Homogeneous in light, exactly linear in it, or the authors' released table."""
     size: float = 100.0
     """Longest side of the objects in mm."""
     extinction: float = 0.1

@@ -159,9 +159,11 @@ PRESETS = {"default": DEFAULT, "paper": PAPER, "released": RELEASED}
 
 # Light: the albedo of a point and what it sends out; or albedo, extinction and index
 # of refraction, and the irradiance.
+# Light goes further than occlusion, hence a level more.
+_WIDE = compact_network(k=16, levels=(0.02, 0.05, 0.1, 0.2), lights=1)
 LIT = {
-    "linear": compact_network(k=16, lights=1, linear=True),
-    "homogeneous": compact_network(lights=1),
+    "homogeneous": _WIDE,
+    "linear": replace(_WIDE, linear=True),
     "released": replace(RELEASED, lights=1),
 }
 ILLUMINATION = {name: replace(n, materials=1) for name, n in LIT.items()}

@@ -45,7 +45,7 @@ class LitOptions:
 
     out: Path = Path("runs/lit")
     """Folder for data, checkpoints, metrics.json, report.md and figures."""
-    shapes: int = 240
+    shapes: int = 300
     """Procedural shapes to train on."""
     meshes: Path | None = None
     """A mesh file or a folder of meshes to train on as well."""

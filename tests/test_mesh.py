@@ -220,14 +220,15 @@ def test_samples_are_uniform_by_area(corners):
 
 
 @given(st.floats(0.1, 3), st.floats(-2, 2))
-def test_ground_faces_up_at_the_lowest_vertex(half_extent, lowest):
+def test_ground_faces_up_just_below_the_lowest_vertex(half_extent, lowest):
     vertices, faces = cube()
     mesh = gm.make_mesh(np.add(vertices, [0, lowest + 0.5, 0]), faces)
     both = gm.add_ground(mesh, half_extent)
     assert both.vertices.dtype == np.float32
     np.testing.assert_array_equal(both.material, [0] * len(faces) + [1, 1])
     corners = both.vertices[both.faces[-2:]].astype(float)
-    np.testing.assert_allclose(corners[..., 1], mesh.vertices[:, 1].min())
+    gap = mesh.vertices[:, 1].min() - corners[..., 1]
+    np.testing.assert_allclose(gap, gm.GROUND_GAP, atol=1e-6)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (normal[:, 1] > 0).all()
     assert heron(corners).sum() == pytest.approx(4 * half_extent**2, rel=1e-4)
