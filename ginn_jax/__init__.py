@@ -14,9 +14,10 @@ Modules, in the order the data flows; each imports only what stands before it:
     camera            pinhole cameras
     libllvm, renderer the ray tracer, found and loaded
     reference         ambient occlusion and G-buffers by ray tracing
-    lighting          environment maps, procedural skies, point lights
+    lighting          environment maps, procedural skies and studios, point lights
     irradiance        direct and indirect irradiance by path tracing
-    subsurface        light that leaves a translucent object, by random walks
+    subsurface        radiant exitance by random walks in a medium
+    objects           which objects and lights there are, and which go together
     voxels            fixed-capacity voxel hash under jit
     packets           radius search by packets of queries under jit
     neighbors         radius search on the host: exact, sizes itself
@@ -24,21 +25,34 @@ Modules, in the order the data flows; each imports only what stands before it:
     receptive_field   what an edge shows a kernel, what its sender weighs
     mcconv            Monte Carlo convolution, tile by tile
     dataset           shaded points: one type for a cloud and for a G-buffer
+    lit_clouds        clouds in colour on disk, and one channel of them
+    lit_scenes        scenes with materials and a light; global illumination, scattering
     scenes            from objects to clouds with ground truth, in worker processes
     architecture      the network as a table of layers; presets
     geometry          levels, edges and weights of a cloud; capacities and demands
     network           f_3D and f_2D
+    example           what a training step computes before any parameter enters
     train             one jitted step: geometry, gradient, update
     checkpoint        saving, resuming, loading weights
     fit               the training loop of a run
+    shading           f_3D of a cloud and f_2D of queries, in every colour channel
     upsample          shading at a lower rate, guided by the G-buffer
     image             from a cloud and a G-buffer to an image
+    relight           what does not depend on the light, kept for any light
     metrics           errors, noise floors, equal ray counts
-    evaluate          errors at points, in images, against run time
+    evaluate          errors of ambient occlusion: points, images, against run time
+    evaluate_light    the same for effects that carry light
     report            metrics.json, report.md and figures of an experiment
+    experiment        what every experiment does around its effect
+    lit_experiment    what the experiments of effects that carry light share
 
 Shape letters: N source points, M queries, E edges, C channels, D kernel inputs,
 L levels, B batch, V F mesh vertices and faces, H W image.
+
+Light is linear RGB. Irradiance is what arrives at a surface, direct from the light or
+indirect after at least one bounce, before the surface's albedo; radiant exitance is
+what leaves. What is displayed is (direct + indirect) albedo / pi, or exitance / pi. A
+network sees one channel, in units of the mean light of the cloud.
 
 Units: lengths are in units of the longest side of the object's bounding box; the
 object is centred, +y is up, and the ground touches its lowest point. Ambient
