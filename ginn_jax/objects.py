@@ -140,8 +140,10 @@ def pair_up(
     for i, source in enumerate(objects):
         for k in range(each):
             light = lights[(i * each + k) % len(lights)]
-            seed = (source.seed if source.path is None else i) * each + k
             name = f"{source.name}__{light.name}"
+            seed = source.seed * each + k
+            if source.path is not None:
+                seed = zlib.crc32(name.encode())
             pairs.append(replace(source, name=name, light=light, seed=seed))
     return pairs
 

@@ -1,0 +1,166 @@
+"""The experiments and benchmarks of light, small, from nothing to their reports."""
+
+import json
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+import tiny
+
+from benchmarks import generation
+from benchmarks import relight as relight_benchmark
+from experiments import gi_train, sss_train
+from ginn_jax import architecture, evaluate_light, image, lit_experiment
+from ginn_jax.errors import InputError
+from ginn_jax.lit_clouds import LitCloud
+from ginn_jax.shading import Encoded
+
+SMALL = {
+    "shapes": 2,
+    "test_shapes": 2,
+    "paths": 4,
+    "points": 1000,
+    "steps": 2,
+    "resolution": 32,
+    "resolution_scale": 1.0,
+    "quick": True,
+}
+EFFECTS = {
+    "gi": (gi_train, architecture.ILLUMINATION, {"materials": 1}),
+    "sss": (sss_train, architecture.SCATTERING, {"materials": 3, "asks": "all"}),
+}
+
+
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_a_small_run_leaves_all_that_is_promised(effect, tmp_path, monkeypatch):
+    script, table, more = EFFECTS[effect]
+    network = replace(tiny.ONE_LEVEL, lights=1, **more)
+    monkeypatch.setitem(table, "homogeneous", network)
+    monkeypatch.setattr(image, "BLOCK", 128)
+    options = script.Options(out=tmp_path, **SMALL)
+    with tiny.cheap_compiling(), jax.numpy_dtype_promotion("standard"):
+        script.main(options)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["steps"] == 2
+    assert metrics["unseen shapes"]["clouds"] == 2
+    assert metrics["unseen point lights"]["clouds"] == 2
+    for key in ("relative_mse_3d", "equal_rays", "relative_mse_2d", "dssim_2d"):
+        assert np.isfinite(metrics[key])
+    paths = [r["mse_2d"] for r in metrics["error_against_time"] if "paths" in r]
+    assert paths[0] > paths[-1]
+    for name in ("learning_curve", "views", "error_against_time"):
+        assert (tmp_path / f"{name}.png").stat().st_size > 1000
+    assert "unseen point lights" in (tmp_path / "report.md").read_text()
+    if effect == "gi":
+        return
+    with pytest.raises(InputError, match="--size"):
+        script.main(replace(options, size=0.0))
+
+
+def test_seen_and_unseen_share_no_object_and_no_light(tmp_path):
+    maps = tmp_path / "maps"
+    maps.mkdir()
+    (maps / "a.hdr").write_bytes(b"seen")
+    options = lit_experiment.LitOptions(shapes=40, envmaps=maps, lights=2)
+    seen, unseen = lit_experiment.choose_sources(options)
+    assert len(seen) == 80
+    assert len({s.name for s in seen}) == 80
+    tests = [s for sources in unseen.values() for s in sources]
+    for part in ("seed", "name"):
+        lights = [{getattr(s.light, part) for s in side} for side in (seen, tests)]
+        assert not lights[0] & lights[1]
+    objects = [{s.name.split("__")[0] for s in side} for side in (seen, tests)]
+    assert not objects[0] & objects[1]
+    assert any(s.light.path for s in seen)
+
+
+def test_the_papers_split_says_what_it_lacks():
+    options = lit_experiment.LitOptions(shapes=40, split="paper")
+    with pytest.raises(InputError, match="1700"):
+        lit_experiment.choose_sources(options)
+    seen, unseen = lit_experiment.choose_sources(replace(options, shapes=1700))
+    assert len(seen) == 1000 * 20
+    assert [len(s) for s in unseen.values()] == [200 * 5, 500 * 5]
+    lights = [{s.light.name for s in part} for part in (seen, *unseen.values())]
+    assert not lights[0] & (lights[1] | lights[2])
+    assert not lights[1] & lights[2]
+
+
+def cloud_of(light, seed=0):
+    """Random points whose target is noise about half of their light."""
+    rng = np.random.default_rng(seed)
+    count = len(light)
+    noise = 0.1 * light.mean(axis=0) * rng.normal(size=light.shape)
+    columns = (
+        rng.normal(size=(count, 3)),
+        rng.normal(size=(count, 3)),
+        np.zeros(count),
+        light,
+        0.5 * light + noise,
+        np.broadcast_to((0.1 * light.mean(axis=0)) ** 2, light.shape),
+    )
+    kinds = ("f4", "f4", "i4", "f4", "f4", "f4")
+    arrays = (np.asarray(c, k) for c, k in zip(columns, kinds, strict=True))
+    return LitCloud(*arrays, np.ones((1, 3), np.float32), np.zeros(0))
+
+
+def test_errors_are_in_units_of_light_and_free_of_noise():
+    light = np.random.default_rng(1).gamma(1.0, size=(20000, 3)).astype(np.float32)
+    encoded = Encoded(None, None, None, None, light.mean(axis=0))  # type: ignore
+    cloud = cloud_of(light)
+    exact = evaluate_light.unit_errors(encoded, cloud, 0.5 * light)
+    assert abs(exact["mse_3d"]) < 1e-3
+    assert exact["noise_floor_3d"] == pytest.approx(0.01, rel=0.01)
+    wrong = evaluate_light.unit_errors(
+        encoded, cloud, 0.5 * light + 0.2 * light.mean(0)
+    )
+    assert wrong["mse_3d"] == pytest.approx(0.04, rel=0.05)
+    assert wrong["relative_mse_3d"] == pytest.approx(0.04 / 0.25, rel=0.06)
+    bright = encoded._replace(scale=1e4 * encoded.scale)
+    again = evaluate_light.unit_errors(bright, cloud_of(1e4 * light), 5e3 * light)
+    assert again["mse_3d"] == pytest.approx(exact["mse_3d"], abs=1e-5)
+
+
+def test_unlit_channels_have_no_say():
+    light = np.random.default_rng(1).gamma(1.0, size=(2000, 3)).astype(np.float32)
+    light[:, 2] = 0
+    encoded = Encoded(None, None, None, None, light.mean(axis=0))  # type: ignore
+    found = evaluate_light.unit_errors(encoded, cloud_of(light), 0.5 * light)
+    assert np.isfinite(list(found.values())).all()
+
+
+def test_grey_light_on_grey_things_is_one_channel():
+    numbers = np.random.default_rng(0).uniform(size=(1, 5, 1)).repeat(3, axis=0)
+    assert evaluate_light.distinct_channels(numbers, numbers)[0].shape[0] == 1
+    coloured = numbers * np.array([1, 1, 2])[:, None, None]
+    assert evaluate_light.distinct_channels(numbers, coloured)[1].shape[0] == 3
+
+
+def test_relight_benchmark(tmp_path, monkeypatch):
+    network = replace(tiny.ONE_LEVEL, lights=1, materials=1)
+    monkeypatch.setitem(relight_benchmark.NETWORKS, "illumination, linear", network)
+    options = relight_benchmark.Options(
+        out=tmp_path,
+        resolution=24,
+        points=1000,
+        repeats=1,
+        networks=("illumination, linear",),
+    )
+    monkeypatch.setattr(image, "BLOCK", 128)
+    with tiny.cheap_compiling():
+        metrics = relight_benchmark.main(options)
+    [row] = metrics["rows"]
+    assert row["largest_difference"] < 1e-3
+    assert row["saving"] > 0
+    with pytest.raises(InputError, match="no network"):
+        relight_benchmark.main(replace(options, networks=("none",)))
+
+
+def test_generation_benchmark(tmp_path):
+    options = generation.Options(
+        out=tmp_path, scenes=1, points=2000, paths=16, repeats=1
+    )
+    [row] = generation.main(options)["rows"]
+    assert row["mean_difference"] < 0.1
+    assert row["ours"] > 0
