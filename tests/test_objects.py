@@ -282,7 +282,8 @@ def test_origin_knows_the_contents_of_files(tmp_path):
     assert third != second
     assert third["light"] == second["light"]
     # Files that were moved are the same.
-    moved = sky.rename(tmp_path / "elsewhere.exr")
+    (tmp_path / "elsewhere").mkdir()
+    moved = sky.rename(tmp_path / "elsewhere" / "sky.exr")
     [pair] = pair_up(file_sources([thing]), file_lights([moved]), 1)
     assert origin_of(pair) == third
 
