@@ -16,6 +16,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     reference         ambient occlusion and G-buffers by ray tracing
     lighting          environment maps, procedural skies and studios, point lights
     irradiance        direct and indirect irradiance by path tracing
+    slab              albedo of a thick slab of a medium, and its inverse
     subsurface        radiant exitance by random walks in a medium
     objects           which objects and lights there are, and which go together
     voxels            fixed-capacity voxel hash under jit
@@ -44,6 +45,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     evaluate_light    the same for effects that carry light
     report            metrics.json, report.md and figures of an experiment
     experiment        what every experiment does around its effect
+    lit_report        report.md of effects that carry light
     lit_experiment    what the experiments of effects that carry light share
 
 Shape letters: N source points, M queries, E edges, C channels, D kernel inputs,

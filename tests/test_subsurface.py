@@ -11,14 +11,13 @@ from ginn_jax.irradiance import direct_irradiance, light_scene
 from ginn_jax.lighting import EnvironmentMap, PointLight, constant_sky, studio
 from ginn_jax.mesh import Mesh
 from ginn_jax.renderer import use_mitsuba
-from ginn_jax.subsurface import (
-    Medium,
+from ginn_jax.slab import (
     external_reflectance,
     internal_reflectance,
     single_scattering_albedo,
     slab_albedo,
-    subsurface_exitance,
 )
+from ginn_jax.subsurface import Medium, subsurface_exitance
 
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
 SLAB = trimesh.creation.box((1, 1, 0.1))
