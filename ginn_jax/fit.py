@@ -155,7 +155,8 @@ def load_losses(folder: Path, steps: int) -> np.ndarray:
 def step_batch(config: Training, clouds: Sequence[Cloud], step: int) -> ShadedPoints:
     """The clouds of a step, each in a random one of its colours."""
     order = batch_order(len(clouds), config.batch_size, step, seed=config.seed)
-    channels = np.random.default_rng((config.seed, step)).integers(0, 3, len(order))
+    rng = np.random.default_rng((config.seed, step))
+    channels = rng.integers(0, 3, len(order)).tolist()
     return stack_clouds(
         [channel_of(clouds[i], c) for i, c in zip(order, channels, strict=True)]
     )
