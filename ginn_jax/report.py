@@ -133,7 +133,7 @@ def draw_color_views(
             axes.set_title(f"{title}: {names[number]}" if not number else names[number])
             axes.title.set_fontsize(8)
             axes.axis("off")
-    figure.savefig(path, dpi=120)
+    figure.savefig(path, dpi=90)
 
 
 def draw_error_against_time(
