@@ -190,7 +190,7 @@ def paper_sources(
         pair_up(o, lit, count)
         for o, lit, (_, count) in zip(objects_of, lights_of, parts, strict=True)
     )
-    return seen, {"shapes": validation, "meshes": test}
+    return seen, {"validation": validation, "test": test}
 
 
 def training(
@@ -241,7 +241,7 @@ def evaluation(
         metrics |= {f"unseen {name}": pooled, f"unseen {name}, each": rows}
     shown = [(s[i], clouds[n][i]) for n, s in unseen.items() for i in range(2)][:6]
     images = image_evaluation(options, config, limits, model, settings, shown)
-    return metrics["unseen shapes"] | metrics | images
+    return metrics[f"unseen {next(iter(unseen))}"] | metrics | images
 
 
 def image_evaluation(
