@@ -123,7 +123,8 @@ def run_experiment(
         settings = replace(settings, points=PAPER_SPLIT.points, paths=PAPER_SPLIT.paths)
     folder = options.out / "data"
     clouds = make(console, "training clouds", seen, settings, folder / "training")
-    exact = replace(settings, paths=VALIDATION_PATHS, targets=settings.points // 5)
+    paths = max(settings.paths, VALIDATION_PATHS)
+    exact = replace(settings, paths=paths, targets=settings.points // 5)
     exact = exact if not options.quick else replace(exact, paths=16)
     tests = {
         name: make(console, f"unseen, {name}", sources, exact, folder / name)
