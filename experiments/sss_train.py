@@ -28,19 +28,19 @@ class Options(LitOptions):
     """Homogeneous in light, exactly linear in it, or the authors' released table."""
     size: float = 100.0
     """Longest side of the objects in mm."""
-    extinction: float = 0.1
-    """Mean extinction of the media in 1/mm."""
+    absorption: float = 0.1
+    """Mean reduced absorption coefficient of the media in 1/mm."""
 
 
 def main(options: Options) -> dict[str, Any]:
     """Run the experiment; returns what metrics.json holds."""
-    if not (options.size > 0 and options.extinction > 0):
-        raise InputError("--size and --extinction must be positive")
+    if not (options.size > 0 and options.absorption > 0):
+        raise InputError("--size and --absorption must be positive")
     settings = Scattering(
         options.points,
         options.paths,
         size=options.size,
-        extinction=options.extinction,
+        absorption=options.absorption,
     )
     network = SCATTERING[options.preset]
     return run_experiment(options, settings, network, "Subsurface scattering")

@@ -16,7 +16,7 @@ from ginn_jax.errors import InputError
 LARGEST_HALF = 65504.0
 LIGHTS = ("irradiance", "target", "variance")
 # Extinctions, in units per length of the object, go in by log(1 + e) / log(1 + this).
-DENSE = 50.0
+DENSE = 500.0
 
 
 class LitCloud(NamedTuple):

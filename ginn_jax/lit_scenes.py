@@ -22,9 +22,12 @@ from ginn_jax.lit_clouds import LitCloud
 from ginn_jax.mesh import Samples, sample_surface
 from ginn_jax.objects import Source, load_light, load_object
 from ginn_jax.reference import Scene, ambient_occlusion, build_scene
+from ginn_jax.slab import single_scattering_albedo
 from ginn_jax.subsurface import Medium, subsurface_exitance
 
 FAR, PROBE_RAYS = 100.0, 32
+# Mean free paths in the length of an object beyond which nothing is seen to change.
+DENSEST = 500.0
 
 
 @dataclass(frozen=True)
@@ -47,9 +50,9 @@ class Illumination:
 class Scattering:
     """What makes the ground truth of subsurface scattering; `Illumination` has more.
 
-    The object's longest side measures `size` mm, and its medium's extinction is drawn
-    from an exponential distribution of mean `extinction` per mm (paper, section
-    "Training Data Generation"), kept between 1/10 and 5 times that.
+    The object's longest side measures `size` mm, and its medium's reduced absorption
+    coefficient is drawn from an exponential distribution of mean `absorption` per mm
+    (paper, section "Training Data Generation"), kept between 1/10 and 5 times that.
     """
 
     points: int = 20_000
@@ -57,7 +60,7 @@ class Scattering:
     looks: int = 128
     targets: int | None = None
     size: float = 100.0
-    extinction: float = 0.1
+    absorption: float = 0.1
 
 
 class Lit(NamedTuple):
@@ -73,7 +76,7 @@ def light_up(source: Source, settings: Illumination | Scattering) -> Lit:
     scatters = isinstance(settings, Scattering)
     mesh = load_object(source, ground=not scatters)
     albedo = draw_albedo(source.seed)[: 1 if scatters else 2]
-    medium = draw_medium(source.seed, settings) if scatters else np.zeros(0)
+    medium = draw_medium(albedo[0], source.seed, settings) if scatters else np.zeros(0)
     return Lit(light_scene(mesh, albedo, load_light(source)), albedo, medium)
 
 
@@ -82,12 +85,20 @@ def draw_albedo(seed: int) -> Float[np.ndarray, "2 3"]:
     return np.random.default_rng((seed, 4)).uniform(0, 1, (2, 3)).astype(np.float32)
 
 
-def draw_medium(seed: int, settings: Scattering) -> Float[np.ndarray, "2"]:
-    """Extinction per length of the object, and index of refraction."""
+def draw_medium(
+    albedo: Float[np.ndarray, "3"], seed: int, settings: Scattering
+) -> Float[np.ndarray, "2"]:
+    """Extinction per length of the object, and index of refraction.
+
+    The extinction is that at which the mean of the colours absorbs as much as was
+    drawn: absorption / (1 - single-scattering albedo), at most `DENSEST`.
+    """
     rng = np.random.default_rng((seed, 5))
-    relative = np.clip(rng.exponential(), 0.1, 5.0)
-    per_length = relative * settings.extinction * settings.size
-    return np.array([per_length, rng.uniform(1.0, 1.5)])
+    absorption = np.clip(rng.exponential(), 0.1, 5.0) * settings.absorption
+    ior = rng.uniform(1.0, 1.5)
+    alpha = single_scattering_albedo(albedo, ior)
+    extinction = absorption * settings.size / np.mean(1 - alpha)
+    return np.array([min(extinction, DENSEST), ior])
 
 
 def transport(
