@@ -11,6 +11,7 @@ from ginn_jax import scenes
 from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import load_lit_cloud
 from ginn_jax.lit_scenes import (
+    DENSEST,
     Illumination,
     Scattering,
     draw_albedo,
@@ -137,19 +138,23 @@ def test_materials_are_in_their_ranges(seed):
     assert albedo.min() >= 0
     assert albedo.max() <= 1
     np.testing.assert_array_equal(draw_albedo(seed), albedo)
-    extinction, ior = draw_medium(seed, Scattering())
-    assert 1 <= extinction <= 50
+    extinction, ior = draw_medium(albedo[0], seed, Scattering())
+    assert 1 <= extinction <= DENSEST
     assert 1 <= ior <= 1.5
-    twice = draw_medium(seed, Scattering(size=200.0))
-    np.testing.assert_allclose(twice, [2 * extinction, ior])
+    twice = draw_medium(albedo[0], seed, Scattering(size=200.0))
+    np.testing.assert_allclose(twice, [min(2 * extinction, DENSEST), ior])
 
 
 def test_materials_are_drawn_as_the_paper_says():
-    """Uniform, and extinctions exponential of mean .1 per mm but for their limits."""
+    """Uniform, and absorption exponential of mean .1 per mm but for its limits.
+
+    Nothing scatters in a black medium: there, extinction is absorption.
+    """
     albedo = np.array([draw_albedo(s) for s in range(500)]).reshape(500, 6)
     assert np.abs(albedo.mean(0) - 0.5).max() < 4 / np.sqrt(12 * 500)
     assert np.abs(np.corrcoef(albedo.T) - np.eye(6)).max() < 4.5 / np.sqrt(500)
-    extinction, ior = np.array([draw_medium(s, Scattering()) for s in range(500)]).T
+    media = [draw_medium(np.zeros(3), s, Scattering()) for s in range(500)]
+    extinction, ior = np.array(media).T
     assert ior.mean() == pytest.approx(1.25, abs=4 * 0.5 / np.sqrt(12 * 500))
     for share in (0.3, 1.0, 3.0):
         kept = np.exp(-share)
@@ -209,7 +214,7 @@ def test_file_of_occlusion_is_made_again(sources, tmp_path):
 def test_every_setting_and_light_is_in_the_origin(sources):
     changes = [{}, {"points": 2}, {"paths": 2}, {"looks": 2}, {"targets": 2}]
     made = [Illumination(**c) for c in changes]
-    made += [Scattering(**c) for c in [*changes, {"size": 2.0}, {"extinction": 2.0}]]
+    made += [Scattering(**c) for c in [*changes, {"size": 2.0}, {"absorption": 2.0}]]
     found = [str(cloud_origin(sources[0], s)) for s in made]
     found += [str(cloud_origin(s, made[0])) for s in sources[1:]]
     assert len(set(found)) == len(found) == 15
