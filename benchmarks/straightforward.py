@@ -61,7 +61,7 @@ def shade_plainly(
     inputs = jnp.concatenate([offset, *products], axis=-1)
     weight = jnp.where(real, encoded.area[sender] / (jnp.pi * radius**2), 0.0)
     kernel = Kernel(*variables["shader"]["params"]["query"]["kernel"])
-    values = perceptron(kernel, inputs) * encoded.codes[sender] * weight[:, None]
+    values = perceptron(kernel, inputs) * encoded.code.free[sender] * weight[:, None]
     x = jax.ops.segment_sum(values, receiver, queries.mask.shape[0])
     return head(variables["shader"]["params"], x, queries.normal), tested, found
 
