@@ -19,6 +19,7 @@ from benchmarks.timing import Timing, circumstances, describe, measure
 from ginn_jax import architecture, image, lit_scenes, objects, reference, report
 from ginn_jax.architecture import Network
 from ginn_jax.camera import orbit_camera
+from ginn_jax.checkpoint import load_weights
 from ginn_jax.commandline import require, start
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model
@@ -44,6 +45,8 @@ class Options:
     """Points of the cloud."""
     repeats: int = 7
     """Timed calls of each."""
+    run: Path | None = None
+    """A finished run of gi_train or sss_train, to take its network and limits from."""
     networks: tuple[str, ...] = (
         "illumination, homogeneous",
         "illumination, linear",
@@ -95,13 +98,13 @@ def in_random_light(samples: Samples, medium: np.ndarray, seed: int) -> LitCloud
     return LitCloud(position, normal, material, light, light, light, albedo, medium)
 
 
-def compare(options: Options, network: Network) -> dict[str, Any]:
+def compare(options: Options, network: Network, limits: Limits) -> dict[str, Any]:
     """Times of one network: from scratch, relit, and in grey light."""
     cloud, pixels = lit_pair(options, network)
     state = init_state(Training(network, steps=1))
     variables = jax.device_put(state.variables, jax.devices()[0])
     model = Model(variables, jax.random.key(0))
-    scratch, limits = from_scratch(network, model, cloud, pixels)
+    scratch, limits = from_scratch(network, limits, model, cloud, pixels)
     grey = [
         c._replace(
             irradiance=np.repeat(c.irradiance[:, :1], 3, axis=1),
@@ -115,7 +118,7 @@ def compare(options: Options, network: Network) -> dict[str, Any]:
     calls = {
         "from scratch": scratch,
         "relit": lambda: relight(network, variables, ready, cloud, pixels),
-        "from scratch, grey": from_scratch(network, model, *grey)[0],
+        "from scratch, grey": from_scratch(network, limits, model, *grey)[0],
     }
     difference = np.abs(calls["relit"]() - np.maximum(scratch(), 0.0)).max()
     times = measure(calls, options.repeats)
@@ -128,7 +131,11 @@ def compare(options: Options, network: Network) -> dict[str, Any]:
 
 
 def from_scratch(
-    network: Network, model: Model, cloud: LitCloud, pixels: LitCloud
+    network: Network,
+    limits: Limits,
+    model: Model,
+    cloud: LitCloud,
+    pixels: LitCloud,
 ) -> tuple[Callable[[], Any], Limits]:
     """A call that shades the pixels from nothing, and limits that hold it."""
 
@@ -139,8 +146,13 @@ def from_scratch(
         ends = model.variables, encoded, pixels.position, pixels.normal
         return image.shade_points(network, limits, *ends, *numbers)
 
-    limits = shade(uniform_limits(network, 1 << 18))[1]
+    limits = shade(limits)[1]
     return lambda: shade(limits)[0], limits
+
+
+def small_limits(network: Network) -> Limits:
+    """Limits that have to be raised, so that they end up close to the need."""
+    return uniform_limits(network, 1 << 12)
 
 
 def row_of(times: dict[str, Timing]) -> dict[str, Any]:
@@ -161,7 +173,11 @@ def main(options: Options) -> dict[str, Any]:
     begin = time.perf_counter()
     if unknown := set(options.networks) - set(NETWORKS):
         raise InputError(f"no network {unknown.pop()!r}: there are {list(NETWORKS)}")
-    rows = [{"network": n} | compare(options, NETWORKS[n]) for n in options.networks]
+    cases = {n: (NETWORKS[n], small_limits(NETWORKS[n])) for n in options.networks}
+    if options.run is not None:
+        config, limits, _ = load_weights(options.run)
+        cases = {"of the run": (config.network, limits)}
+    rows = [{"network": n} | compare(options, *case) for n, case in cases.items()]
     metrics = {"rows": rows} | circumstances(options, begin)
     heads = {"network": "network", "pixels": "pixels", "scratch_ms": "from scratch ms"}
     heads |= {"relit_ms": "relit ms", "saving": "saving", "grey_ms": "grey ms"}
