@@ -18,7 +18,7 @@ from rich.console import Console
 from ginn_jax import architecture, evaluate, fit, objects, report, scenes
 from ginn_jax.commandline import require, start
 from ginn_jax.errors import InputError
-from ginn_jax.experiment import Clock, closing, make, train
+from ginn_jax.experiment import Clock, closing, make, train, training
 from ginn_jax.geometry import Limits
 from ginn_jax.image import limits_at, with_disk_radius
 from ginn_jax.mesh import find_meshes
@@ -99,7 +99,8 @@ def main(options: Options) -> dict[str, Any]:
     unseen = make(console, "unseen clouds", test_sources, exact, folder / "unseen")
     clock.lap("data", begin)
 
-    config = training(options, len(clouds))
+    network = architecture.PRESETS[options.preset]
+    config = training(options, network, options.points, len(clouds))
     extra = {"occlusion": asdict(settings), "objects": [s.name for s in train_sources]}
     run = train(console, config, clouds, options.out, options.resume, extra)
     clock.parts |= run.seconds
@@ -147,21 +148,6 @@ def unseen_sources(options: Options) -> list[objects.Source]:
     if options.test_meshes is not None:
         sources += objects.file_sources(find_meshes(options.test_meshes))
     return sources
-
-
-def training(options: Options, clouds: int) -> Training:
-    """The training configuration that the options ask for."""
-    return Training(
-        architecture.PRESETS[options.preset],
-        steps=options.steps,
-        batch_size=options.batch,
-        points=options.points * 4 // 5,
-        queries=options.points // 5,
-        learning_rate=options.learning_rate,
-        schedule=options.schedule,
-        epoch_steps=max(clouds // options.batch, 1),
-        seed=options.seed,
-    )
 
 
 def evaluation(

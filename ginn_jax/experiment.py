@@ -16,6 +16,7 @@ from rich.progress import (
 )
 
 from ginn_jax import fit, report, scenes
+from ginn_jax.architecture import Network
 from ginn_jax.lit_clouds import Cloud
 from ginn_jax.objects import Source
 from ginn_jax.process import available_cores
@@ -82,6 +83,21 @@ def train(
                 console.print(f"step {step} of {config.steps}: {text}")
 
         return fit.fit(config, clouds, out, fit.Schedule(), tell, resume, extra)
+
+
+def training(options: Any, network: Network, points: int, clouds: int) -> Training:
+    """The training configuration that the options ask for."""
+    return Training(
+        network,
+        steps=options.steps,
+        batch_size=options.batch,
+        points=points * 4 // 5,
+        queries=points // 5,
+        learning_rate=options.learning_rate,
+        schedule=options.schedule,
+        epoch_steps=max(clouds // options.batch, 1),
+        seed=options.seed,
+    )
 
 
 def closing(

@@ -113,9 +113,7 @@ def load_lit_cloud(path: Path, origin: dict[str, Any] | None = None) -> LitCloud
 def to_octahedron(normal: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N 2"]:
     """Unit vectors by where they meet the octahedron, unfolded (Meyer et al. 2010)."""
     flat = normal / np.abs(normal).sum(axis=1, keepdims=True)
-    x, y, z = flat.astype(np.float64).T
-    folded = np.stack([(1 - abs(y)) * _sign(x), (1 - abs(x)) * _sign(y)], axis=1)
-    plane = np.where(z[:, None] < 0, folded, np.stack([x, y], axis=1))
+    plane = _fold(*flat.astype(np.float64).T)
     return np.round(plane * 32767).astype(np.int16)
 
 
@@ -123,10 +121,16 @@ def from_octahedron(code: Int[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
     """The unit vectors of `to_octahedron`, to about 1e-4."""
     x, y = code.T / 32767.0
     z = 1 - abs(x) - abs(y)
-    folded = np.stack([(1 - abs(y)) * _sign(x), (1 - abs(x)) * _sign(y)], axis=1)
-    plane = np.where(z[:, None] < 0, folded, np.stack([x, y], axis=1))
-    found = np.concatenate([plane, z[:, None]], axis=1)
+    found = np.concatenate([_fold(x, y, z), z[:, None]], axis=1)
     return (found / np.linalg.norm(found, axis=1, keepdims=True)).astype(np.float32)
+
+
+def _fold(
+    x: Float[np.ndarray, "N"], y: Float[np.ndarray, "N"], z: Float[np.ndarray, "N"]
+) -> Float[np.ndarray, "N 2"]:
+    """The lower half of the octahedron folded out of the plane, or into it."""
+    folded = np.stack([(1 - abs(y)) * _sign(x), (1 - abs(x)) * _sign(y)], axis=1)
+    return np.where(z[:, None] < 0, folded, np.stack([x, y], axis=1))
 
 
 def _sign(x: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:

@@ -15,7 +15,7 @@ from ginn_jax.architecture import Network
 from ginn_jax.commandline import require
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model, mean_rows
-from ginn_jax.experiment import Clock, closing, make, train
+from ginn_jax.experiment import Clock, closing, make, train, training
 from ginn_jax.lighting import find_environments
 from ginn_jax.lit_clouds import LitCloud, network_numbers
 from ginn_jax.lit_report import write_report
@@ -192,23 +192,6 @@ def paper_sources(
         for o, lit, (_, count) in zip(objects_of, lights_of, parts, strict=True)
     )
     return seen, {"validation": validation, "test": test}
-
-
-def training(
-    options: LitOptions, network: Network, points: int, clouds: int
-) -> Training:
-    """The training configuration that the options ask for."""
-    return Training(
-        network,
-        steps=options.steps,
-        batch_size=options.batch,
-        points=points * 4 // 5,
-        queries=points // 5,
-        learning_rate=options.learning_rate,
-        schedule=options.schedule,
-        epoch_steps=max(clouds // options.batch, 1),
-        seed=options.seed,
-    )
 
 
 def unit_floor(clouds: Sequence[LitCloud]) -> float:
