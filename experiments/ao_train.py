@@ -50,8 +50,8 @@ class Options:
     """Occlusion radius, in units of the object's longest side."""
     points: int = 20_000
     """Samples per object."""
-    preset: Literal["default", "paper", "released"] = "default"
-    """Layer table: ours, the paper's, or the authors' release."""
+    preset: Literal["default", "paper", "released", "only_2d", "only_3d"] = "default"
+    """Layer table: ours, the paper's, the authors' release, or an ablation of ours."""
     schedule: Literal["cosine", "paper"] = "cosine"
     """Learning rate: warm-up and cosine decay, or the paper's x0.7 every 10 epochs."""
     steps: int = 3000

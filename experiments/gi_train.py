@@ -23,8 +23,10 @@ class Options(LitOptions):
 
     out: Path = Path("runs/gi_train")
     """Folder for data, checkpoints, metrics.json, report.md and figures."""
-    preset: Literal["homogeneous", "linear", "released"] = "homogeneous"
-    """Homogeneous in light, exactly linear in it, or the authors' released table."""
+    preset: Literal["homogeneous", "linear", "released", "only_2d", "only_3d"] = (
+        "homogeneous"
+    )
+    """Homogeneous in light, exactly linear in it, the authors' table, or an ablation."""
 
 
 def main(options: Options) -> dict[str, Any]:

@@ -24,8 +24,10 @@ class Options(LitOptions):
 
     out: Path = Path("runs/sss_train")
     """Folder for data, checkpoints, metrics.json, report.md and figures."""
-    preset: Literal["homogeneous", "linear", "released"] = "homogeneous"
-    """Homogeneous in light, exactly linear in it, or the authors' released table."""
+    preset: Literal["homogeneous", "linear", "released", "only_2d", "only_3d"] = (
+        "homogeneous"
+    )
+    """Homogeneous in light, exactly linear in it, the authors' table, or an ablation."""
     size: float = 100.0
     """Longest side of the objects in mm."""
     absorption: float = 0.1

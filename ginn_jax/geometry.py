@@ -88,12 +88,25 @@ def limit_names(config: Network) -> tuple[str, ...]:
         for i in range(len(config.levels))
         for part in (*Demand._fields, "points")
     ]
+    if needs_areas(config):
+        names += [f"{area_search(config).name}.{part}" for part in Demand._fields]
     for conv in (*config.encoder, config.query):
         if conv is not config.query and transposed(config, conv):
             continue
         names += [f"{conv.name}.{part}" for part in Demand._fields]
         names += [f"{conv.name}.pairs"] if config.density == "kde" else []
     return tuple(names)
+
+
+def needs_areas(config: Network) -> bool:
+    """Whether no convolution's edges tell the area that finest points stand for."""
+    within = any(c.source == c.target == 0 for c in config.encoder)
+    return config.density == "surface" and not within
+
+
+def area_search(config: Network) -> Conv:
+    """The search that tells it then: a convolution of no channels."""
+    return Conv("area", 0, 0, 2.5 * config.levels[0], 0.25, 0)
 
 
 def uniform_limits(config: Network, size: int) -> Limits:
@@ -161,7 +174,8 @@ def build_geometry(
     config: Network, limits: Limits, cloud: Oriented, *, key: Key[Array, ""]
 ) -> tuple[Geometry, Demands]:
     """All of f_3D's geometry; wrong where a demand exceeds its limit."""
-    levels, grids, finest, demands = _build_levels(config, limits, cloud, key)
+    levels, grids, rows, demands = _build_levels(config, limits, cloud, key)
+    finest = levels[0]
     found: dict[str, Edges] = {}
     for conv in reversed(config.encoder):
         receivers = levels[conv.target]
@@ -174,6 +188,13 @@ def build_geometry(
         found[conv.name], more = search(conv, limits, grid, receivers)
         demands |= more
     areas = _level_areas(config, levels, found)
+    if needs_areas(config):
+        conv = area_search(config)
+        edges, more = search(conv, limits, grid_of(config, grids, 0, finest), finest)
+        areas[0] = point_area(
+            finest.position, finest.mask, edges, jnp.float32(conv.radius)
+        )
+        demands |= more
     fields = {}
     for conv in config.encoder:
         ends = levels[conv.source], levels[conv.target]
@@ -181,8 +202,8 @@ def build_geometry(
             config, conv, limits, *ends, found[conv.name], areas.get(conv.source)
         )
         demands |= more
-    grid = grid_of(config, grids, 0, levels[0])
-    return Geometry(levels, finest, fields, areas.get(0), grid), demands
+    grid = grid_of(config, grids, 0, finest)
+    return Geometry(levels, rows, fields, areas.get(0), grid), demands
 
 
 def grid_of(

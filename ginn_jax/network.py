@@ -17,6 +17,8 @@ from ginn_jax.mcconv import apply_stored, init_kernel, mc_conv, mc_conv_mixing
 from ginn_jax.receptive_field import Field
 
 SLOPE = 0.2
+# What a point weighs in a splat that faces another way: little, but never nothing.
+LEAST_LIKENESS = 1e-3
 # The collection of kernel values that are at hand already, see `relight`.
 STORED = "stored"
 Variables = dict[str, Any]
@@ -145,7 +147,9 @@ class Encoder(nn.Module):
             if conv.skip is not None:
                 x = join(done[conv.skip], x)
             done[conv.name] = x
-        free = Norm(config.norm, self.train)(x.free, levels[0].mask)
+        free = x.free
+        if config.encoder:
+            free = Norm(config.norm, self.train)(free, levels[0].mask)
         free = nn.Dense(config.latent, name="latent")(free)
         free = Norm(config.norm, self.train)(free, levels[0].mask)
         return Code(free, None if x.light is None else self._dim(free, x.light))
@@ -154,8 +158,22 @@ class Encoder(nn.Module):
         return Gate(self.config.latent, name="latent_light")(free, light)
 
 
+def splat(values: Float[Array, "N"], field: Field, receivers: int) -> Float[Array, "M"]:
+    """Mean of the values near each receiver, the near and alike oriented first."""
+    near = (1 - jnp.sum(field.inputs[:3] ** 2, axis=0)) ** 2
+    if field.inputs.shape[0] > 3:
+        near *= jnp.maximum(field.inputs[5], 0.0) ** 4 + LEAST_LIKENESS
+    both = jnp.stack([values, jnp.ones_like(values)], axis=1)
+    share = jnp.broadcast_to(near * field.weight, (2, near.size))
+    total, weight = apply_stored(share, both, field, receivers).T
+    return jnp.where(weight > 0, total / jnp.where(weight > 0, weight, 1.0), 0.0)
+
+
 class Shader(nn.Module):
-    """f_2D: one convolution from codes to queries, then two 1x1 layers."""
+    """f_2D: one convolution from codes to queries, then two 1x1 layers.
+
+    A network that splats has its 1x1 layers at the points instead.
+    """
 
     config: Network
     train: bool
@@ -170,8 +188,12 @@ class Shader(nn.Module):
         field: Field,
     ) -> Float[Array, "M"]:
         config = self.config
-        layer = McConv(config, config.query, self.train, name=config.query.name)
         senders = jnp.ones(code.free.shape[0], bool)
+        if config.splat:
+            free = nn.Dense(config.head)(code.free)
+            free = Norm(config.norm, self.train)(free, senders)
+            return splat(nn.Dense(1)(free)[:, 0], field, mask.shape[0])
+        layer = McConv(config, config.query, self.train, name=config.query.name)
         x = layer(code, senders, field, attributes.shape[0])
         attributes, light = enter(config, attributes, light)
         free = Norm(config.norm, self.train)(x.free, mask)
