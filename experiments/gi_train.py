@@ -9,11 +9,11 @@ indirect irradiance, trains, and evaluates on shapes and lights that training ne
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from ginn_jax.architecture import ILLUMINATION
 from ginn_jax.commandline import start
-from ginn_jax.lit_experiment import QUICK, LitOptions, run_experiment
+from ginn_jax.lit_experiment import QUICK, LitOptions, Preset, run_experiment
 from ginn_jax.lit_scenes import Illumination
 
 
@@ -23,10 +23,8 @@ class Options(LitOptions):
 
     out: Path = Path("runs/gi_train")
     """Folder for data, checkpoints, metrics.json, report.md and figures."""
-    preset: Literal["homogeneous", "linear", "released", "only_2d", "only_3d"] = (
-        "homogeneous"
-    )
-    """Homogeneous in light, exactly linear in it, the authors' table, or an ablation."""
+    preset: Preset = "homogeneous"
+    """Homogeneous in light, exactly linear, the authors' table, or an ablation."""
 
 
 def main(options: Options) -> dict[str, Any]:

@@ -9,12 +9,12 @@ that training never saw. `--help` lists every option with its default.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from ginn_jax.architecture import SCATTERING
 from ginn_jax.commandline import start
 from ginn_jax.errors import InputError
-from ginn_jax.lit_experiment import QUICK, LitOptions, run_experiment
+from ginn_jax.lit_experiment import QUICK, LitOptions, Preset, run_experiment
 from ginn_jax.lit_scenes import Scattering
 
 
@@ -24,10 +24,8 @@ class Options(LitOptions):
 
     out: Path = Path("runs/sss_train")
     """Folder for data, checkpoints, metrics.json, report.md and figures."""
-    preset: Literal["homogeneous", "linear", "released", "only_2d", "only_3d"] = (
-        "homogeneous"
-    )
-    """Homogeneous in light, exactly linear in it, the authors' table, or an ablation."""
+    preset: Preset = "homogeneous"
+    """Homogeneous in light, exactly linear, the authors' table, or an ablation."""
     size: float = 100.0
     """Longest side of the objects in mm."""
     absorption: float = 0.1

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from ginn_jax.architecture import Network
-from ginn_jax.camera import orbit_camera
+from ginn_jax.camera import Camera, orbit_camera
 from ginn_jax.dataset import ShadedPoints
 from ginn_jax.geometry import Limits
 from ginn_jax.image import as_openness, encode_cloud, shade_image, shade_points
@@ -17,6 +17,7 @@ from ginn_jax.mesh import Mesh
 from ginn_jax.metrics import dssim, equal_rays, mse, tone_map
 from ginn_jax.network import Variables
 from ginn_jax.reference import (
+    Estimate,
     GBuffer,
     Scene,
     ambient_occlusion,
@@ -113,18 +114,29 @@ def reference_view(
     mesh: Mesh, radius: float, rays: int, seed: int, size: int, azimuth: float = 35.0
 ) -> View:
     """An object with its ray-traced ambient occlusion at every foreground pixel."""
+    view = frame(mesh, orbit_camera(azimuth, width=size, height=size))
+    return with_truth(view, traced(view, radius, rays, seed=seed))
+
+
+def frame(mesh: Mesh, camera: Camera) -> View:
+    """A mesh seen by a camera, with no reference yet."""
     scene = build_scene(mesh)
-    gbuffer = render_gbuffer(scene, orbit_camera(azimuth, width=size, height=size))
-    mask = gbuffer.mask
-    truth = ambient_occlusion(
-        scene,
-        gbuffer.position[mask],
-        gbuffer.normal[mask],
-        radius,
-        rays=rays,
-        seed=seed,
-    )
-    return View(scene, gbuffer, fill(mask, truth.mean), truth.variance)
+    gbuffer = render_gbuffer(scene, camera)
+    nothing = np.zeros(int(gbuffer.mask.sum()), np.float32)
+    return View(scene, gbuffer, fill(gbuffer.mask, nothing), nothing)
+
+
+def traced(view: View, radius: float, rays: int, *, seed: int) -> Estimate:
+    """Ray-traced ambient occlusion at the foreground pixels of a view."""
+    mask = view.gbuffer.mask
+    position, normal = view.gbuffer.position[mask], view.gbuffer.normal[mask]
+    return ambient_occlusion(view.scene, position, normal, radius, rays=rays, seed=seed)
+
+
+def with_truth(view: View, truth: Estimate) -> View:
+    """The view with a reference."""
+    reference = fill(view.gbuffer.mask, truth.mean)
+    return view._replace(reference=reference, variance=truth.variance)
 
 
 def fill(
@@ -200,15 +212,9 @@ def network_row(
 
 def ray_row(view: View, radius: float, rays: int, seed: int) -> Row:
     """Error and time of ray-traced ambient occlusion at `rays` per pixel."""
-    mask = view.gbuffer.mask
-    position, normal = view.gbuffer.position[mask], view.gbuffer.normal[mask]
-    truth, _, seconds = timed(
-        lambda: ambient_occlusion(
-            view.scene, position, normal, radius, rays=rays, seed=seed
-        )
-    )
+    truth, _, seconds = timed(lambda: traced(view, radius, rays, seed=seed))
     row = {"method": f"{rays} rays", "rays": rays, "seconds": seconds}
-    return row | image_errors(view, fill(mask, truth.mean))
+    return row | image_errors(view, fill(view.gbuffer.mask, truth.mean))
 
 
 def mean_rows(rows: Sequence[Row]) -> list[Row]:

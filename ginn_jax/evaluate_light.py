@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ginn_jax.architecture import Network
-from ginn_jax.camera import orbit_camera
+from ginn_jax.camera import Camera, orbit_camera
 from ginn_jax.evaluate import Model, Row, timed
 from ginn_jax.geometry import Limits
 from ginn_jax.image import Encoded, encode_cloud, shade_image, shade_points
-from ginn_jax.irradiance import direct_irradiance
+from ginn_jax.irradiance import ColorEstimate, direct_irradiance
 from ginn_jax.lit_clouds import LitCloud, network_numbers, split_points
 from ginn_jax.lit_scenes import Illumination, Lit, Scattering, light_up, transport
 from ginn_jax.metrics import dssim, equal_rays, tone_map
@@ -115,18 +115,36 @@ def lit_view(
     azimuth: float = 35.0,
 ) -> LitView:
     """A source with its path-traced reference at every foreground pixel."""
-    lit = light_up(source, settings)
     camera = orbit_camera(azimuth, width=size, height=size)
+    view = lit_frame(light_up(source, settings), camera, settings, seed=source.seed)
+    return with_truth(view, traced(view, paths, seed=source.seed))
+
+
+def lit_frame(
+    lit: Lit, camera: Camera, settings: Illumination | Scattering, *, seed: int
+) -> LitView:
+    """A lit scene seen by a camera, with direct light and no reference yet."""
     gbuffer = render_gbuffer(build_scene(lit.scene.mesh), camera)
     position, normal = (a[gbuffer.mask] for a in (gbuffer.position, gbuffer.normal))
     direct = direct_irradiance(
-        lit.scene, position, normal, samples=settings.looks, seed=source.seed
+        lit.scene, position, normal, samples=settings.looks, seed=seed
     )
-    truth = transport(lit, position, normal, paths=paths, seed=source.seed)
+    light = direct, np.zeros_like(direct), np.zeros_like(direct)
     material = gbuffer.material[gbuffer.mask]
-    light = direct, truth.mean, truth.variance
     pixels = LitCloud(position, normal, material, *light, lit.albedo, lit.medium)
     return LitView(lit, gbuffer, pixels)
+
+
+def traced(view: LitView, paths: int, *, seed: int) -> ColorEstimate:
+    """Path tracing of the transported light at the pixels of a view."""
+    ends = view.pixels.position, view.pixels.normal
+    return transport(view.lit, *ends, paths=paths, seed=seed)
+
+
+def with_truth(view: LitView, truth: ColorEstimate) -> LitView:
+    """The view with a reference."""
+    pixels = view.pixels._replace(target=truth.mean, variance=truth.variance)
+    return view._replace(pixels=pixels)
 
 
 def fill(
@@ -221,12 +239,6 @@ def path_row(
     view: LitView, paths: int, seed: int, scale: Float[np.ndarray, "C"]
 ) -> Row:
     """Error and time of path tracing the same pixels with `paths` each."""
-    pixels = view.pixels
-    truth, _, seconds = timed(
-        lambda: transport(
-            view.lit, pixels.position, pixels.normal, paths=paths, seed=seed
-        ),
-        repeats=1,
-    )
+    truth, _, seconds = timed(lambda: traced(view, paths, seed=seed), repeats=1)
     row = {"method": f"{paths} paths", "paths": paths, "seconds": seconds}
     return row | lit_image_errors(view, truth.mean, scale)

@@ -38,6 +38,7 @@ from ginn_jax.train import Training
 UNSEEN_SEED = 10_000_000
 VALIDATION_PATHS = 1024
 PATH_COUNTS = (1, 4, 16, 64)
+Preset = Literal["homogeneous", "linear", "released", "only_2d", "only_3d"]
 
 
 @dataclass(frozen=True)

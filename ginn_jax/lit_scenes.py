@@ -18,8 +18,9 @@ from ginn_jax.irradiance import (
     indirect_irradiance,
     light_scene,
 )
+from ginn_jax.lighting import Light
 from ginn_jax.lit_clouds import LitCloud
-from ginn_jax.mesh import Samples, sample_surface
+from ginn_jax.mesh import Mesh, Samples, sample_surface
 from ginn_jax.objects import Source, load_light, load_object
 from ginn_jax.reference import Scene, ambient_occlusion, build_scene
 from ginn_jax.slab import single_scattering_albedo
@@ -73,11 +74,18 @@ class Lit(NamedTuple):
 
 def light_up(source: Source, settings: Illumination | Scattering) -> Lit:
     """The scene of a source; its materials are drawn by its seed."""
+    mesh = load_object(source, ground=isinstance(settings, Illumination))
+    return light_mesh(mesh, load_light(source), settings, seed=source.seed)
+
+
+def light_mesh(
+    mesh: Mesh, light: Light, settings: Illumination | Scattering, *, seed: int
+) -> Lit:
+    """The scene of a mesh, with its ground if any; materials are drawn by the seed."""
     scatters = isinstance(settings, Scattering)
-    mesh = load_object(source, ground=not scatters)
-    albedo = draw_albedo(source.seed)[: 1 if scatters else 2]
-    medium = draw_medium(albedo[0], source.seed, settings) if scatters else np.zeros(0)
-    return Lit(light_scene(mesh, albedo, load_light(source)), albedo, medium)
+    albedo = draw_albedo(seed)[: 1 if scatters else 2]
+    medium = draw_medium(albedo[0], seed, settings) if scatters else np.zeros(0)
+    return Lit(light_scene(mesh, albedo, light), albedo, medium)
 
 
 def draw_albedo(seed: int) -> Float[np.ndarray, "2 3"]:
@@ -119,8 +127,12 @@ def transport(
 
 
 def lit_cloud(source: Source, settings: Illumination | Scattering) -> LitCloud:
+    """The lit cloud of a source's scene."""
+    return sample_lit(light_up(source, settings), settings, seed=source.seed)
+
+
+def sample_lit(lit: Lit, settings: Illumination | Scattering, *, seed: int) -> LitCloud:
     """Uniform samples of a scene, the light on them, and what transport makes of it."""
-    lit, seed = light_up(source, settings), source.seed
     samples = visible_samples(build_scene(lit.scene.mesh), settings.points, seed)
     position, normal, material = samples
     irradiance = direct_irradiance(
