@@ -106,11 +106,11 @@ def load_run(folder: Path, config: Training, extra: dict[str, Any]) -> Limits:
             raise InputError(
                 f"{path} was made with another {name}: resume with the same"
             )
-    _check_names(path, config.network, limits)
+    check_names(path, config.network, limits)
     return limits
 
 
-def _check_names(path: Path, network: Network, limits: Limits) -> None:
+def check_names(path: Path, network: Network, limits: Limits) -> None:
     """Raise `InputError` unless these are the capacities that the network needs."""
     if {name for name, _ in limits.sizes} != set(limit_names(network)):
         raise InputError(f"{path} is of another version of ginn_jax: train again")
@@ -125,13 +125,13 @@ def load_weights(folder: Path) -> tuple[Training, Limits, Variables]:
     path = folder / "run.json"
     try:
         record = json.loads(path.read_text())
-        config = _training_from(record["training"])
+        config = training_from(record["training"])
         limits = Limits(tuple((k, int(v)) for k, v in record["limits"].items()))
     except FileNotFoundError:
         raise InputError(f"{folder} holds no run: name the --out of one") from None
     except (ValueError, KeyError, AttributeError, TypeError):
         raise InputError(f"{path} is damaged: train again") from None
-    _check_names(path, config.network, limits)
+    check_names(path, config.network, limits)
     here = SingleDeviceSharding(jax.devices()[0])
     like = jax.tree.map(
         lambda s: jax.ShapeDtypeStruct(s.shape, s.dtype, sharding=here),
@@ -144,7 +144,7 @@ def load_weights(folder: Path) -> tuple[Training, Limits, Variables]:
     return config, limits, state.variables
 
 
-def _training_from(record: dict[str, Any]) -> Training:
+def training_from(record: dict[str, Any]) -> Training:
     """The configuration that `save_run` wrote."""
     network = dict(record["network"])
     network["levels"] = tuple(network["levels"])

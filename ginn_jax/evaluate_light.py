@@ -16,9 +16,17 @@ from ginn_jax.camera import Camera, orbit_camera
 from ginn_jax.evaluate import Model, Row, timed
 from ginn_jax.geometry import Limits
 from ginn_jax.image import Encoded, encode_cloud, shade_image, shade_points
-from ginn_jax.irradiance import ColorEstimate, direct_irradiance
+from ginn_jax.irradiance import ColorEstimate
 from ginn_jax.lit_clouds import LitCloud, network_numbers, split_points
-from ginn_jax.lit_scenes import Illumination, Lit, Scattering, light_up, transport
+from ginn_jax.lit_scenes import (
+    Illumination,
+    Lit,
+    Scattering,
+    light_up,
+    lit_points,
+    transport,
+)
+from ginn_jax.mesh import Samples
 from ginn_jax.metrics import dssim, equal_rays, tone_map
 from ginn_jax.objects import Source
 from ginn_jax.reference import GBuffer, build_scene, render_gbuffer
@@ -125,13 +133,9 @@ def lit_frame(
 ) -> LitView:
     """A lit scene seen by a camera, with direct light and no reference yet."""
     gbuffer = render_gbuffer(build_scene(lit.scene.mesh), camera)
-    position, normal = (a[gbuffer.mask] for a in (gbuffer.position, gbuffer.normal))
-    direct = direct_irradiance(
-        lit.scene, position, normal, samples=settings.looks, seed=seed
-    )
-    light = direct, np.zeros_like(direct), np.zeros_like(direct)
-    material = gbuffer.material[gbuffer.mask]
-    pixels = LitCloud(position, normal, material, *light, lit.albedo, lit.medium)
+    seen = gbuffer.position, gbuffer.normal, gbuffer.material
+    samples = Samples(*(a[gbuffer.mask] for a in seen))
+    pixels = lit_points(lit, samples, settings.looks, seed=seed)
     return LitView(lit, gbuffer, pixels)
 
 

@@ -134,16 +134,21 @@ def lit_cloud(source: Source, settings: Illumination | Scattering) -> LitCloud:
 def sample_lit(lit: Lit, settings: Illumination | Scattering, *, seed: int) -> LitCloud:
     """Uniform samples of a scene, the light on them, and what transport makes of it."""
     samples = visible_samples(build_scene(lit.scene.mesh), settings.points, seed)
+    cloud = lit_points(lit, samples, settings.looks, seed=seed)
+    asked = slice(-(settings.targets or len(cloud.position)), None)
+    ends = cloud.position[asked], cloud.normal[asked]
+    truth = transport(lit, *ends, paths=settings.paths, seed=seed)
+    cloud.target[asked], cloud.variance[asked] = truth
+    return cloud
+
+
+def lit_points(lit: Lit, samples: Samples, looks: int, *, seed: int) -> LitCloud:
+    """Points of a scene with the direct light on them; their targets are zero."""
     position, normal, material = samples
     irradiance = direct_irradiance(
-        lit.scene, position, normal, samples=settings.looks, seed=seed
+        lit.scene, position, normal, samples=looks, seed=seed
     )
-    asked = slice(-(settings.targets or len(position)), None)
-    ends = position[asked], normal[asked]
-    truth = transport(lit, *ends, paths=settings.paths, seed=seed)
-    target, variance = np.zeros_like(irradiance), np.zeros_like(irradiance)
-    target[asked], variance[asked] = truth
-    light = irradiance, target, variance
+    light = irradiance, np.zeros_like(irradiance), np.zeros_like(irradiance)
     return LitCloud(position, normal, material, *light, lit.albedo, lit.medium)
 
 

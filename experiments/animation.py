@@ -1,0 +1,247 @@
+"""An animated object: how much each method flickers, a strip of frames, a moving image.
+
+    python -m experiments.animation --effect gi --out runs/animation
+
+Flicker is the mean squared change from frame to frame that the reference does not have.
+`--help` lists every option with its default.
+"""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image
+from rich.console import Console
+
+from ginn_jax import compare, compare_report, evaluate_light, report, sequences
+from ginn_jax.camera import orbit_camera
+from ginn_jax.commandline import require, start
+from ginn_jax.compare import Shot, Stage, Trained
+from ginn_jax.dataset import ShadedPoints
+from ginn_jax.evaluate import Model, View
+from ginn_jax.experiment import bar
+from ginn_jax.lighting import Light, load_environment, procedural_environment
+from ginn_jax.lit_clouds import network_numbers
+from ginn_jax.lit_experiment import UNSEEN_SEED
+from ginn_jax.lit_scenes import light_mesh, lit_points
+from ginn_jax.mesh import Mesh
+from ginn_jax.metrics import tone_map
+from ginn_jax.pretrained import load_manifest, load_pretrained
+from ginn_jax.scenes import Occlusion, Settings
+
+NETWORKS = {compare_report.OURS: "", "2D only": "_only_2d", "3D only": "_only_3d"}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Shade an animation with every method."""
+
+    effect: Literal["ao", "gi", "sss"] = "ao"
+    """Ambient occlusion, global illumination or subsurface scattering."""
+    out: Path = Path("runs/animation")
+    """Folder for metrics.json, report.md, the strip and the moving image."""
+    animation: Path | None = None
+    """An .npz of vertices [T V 3] and faces [F 3]; left out, a procedural one."""
+    envmap: Path | None = None
+    """An environment map; left out, a procedural sky."""
+    frames: int = 12
+    """How many frames, from the first on."""
+    resolution: int = 256
+    """Side of the images in pixels."""
+    reference: int = 256
+    """Rays or paths per pixel of the reference."""
+    points: int = 16_000
+    """Samples of the object and its ground."""
+    looks: int = 512
+    """Directions of the direct light per sample and pixel."""
+    radius: float = 0.1
+    """Occlusion radius."""
+    seed: int = 0
+    """Seed of everything."""
+    quick: bool = False
+    """A few small frames: to try things, not for numbers."""
+
+
+QUICK = {"frames": 2, "resolution": 48, "reference": 8, "points": 3000, "looks": 32}
+
+
+def main(options: Options) -> dict[str, Any]:
+    """Shade all frames; returns what metrics.json holds."""
+    least = {"frames": 2, "resolution": 32, "reference": 2, "points": 1000, "looks": 1}
+    require(options, least | {"seed": 0})
+    console = Console()
+    counts = options.points, options.reference
+    settings = compare.effect_settings(options.effect, *counts, options.radius)
+    meshes = choose_frames(options, ground=options.effect != "sss")
+    light = choose_light(options)
+    networks = load_networks(options)
+    carried = sequences.carried_samples(meshes[0], options.points, seed=options.seed)
+    frames: dict[str, list[np.ndarray]] = {}
+    with bar(console) as progress:
+        task = progress.add_task("frames", total=len(meshes), note="")
+        for mesh in meshes:
+            found, networks = shade_frame(
+                options, settings, mesh, light, carried, networks
+            )
+            for name, image in found.items():
+                frames.setdefault(name, []).append(image)
+            progress.advance(task)
+    metrics = measure(options, {name: np.stack(f) for name, f in frames.items()})
+    report.write_results(options.out, metrics, write_report(metrics))
+    for row in metrics["flicker"]:
+        console.print(f"{row['method']}: flicker {row['flicker']:.3g}")
+    return metrics
+
+
+def choose_frames(options: Options, ground: bool) -> list[Mesh]:
+    """The frames as meshes."""
+    animation = (
+        sequences.procedural_animation(UNSEEN_SEED + options.seed, options.frames)
+        if options.animation is None
+        else sequences.load_animation(options.animation)
+    )
+    return sequences.frames_of(animation, options.frames, ground)
+
+
+def choose_light(options: Options) -> Light:
+    """The light of an animation; ambient occlusion needs none."""
+    if options.envmap is None:
+        return procedural_environment(UNSEEN_SEED + options.seed)
+    return load_environment(options.envmap)
+
+
+def load_networks(options: Options) -> dict[str, Trained]:
+    """The networks of the effect that come with the package."""
+    networks = {}
+    for name, ending in NETWORKS.items():
+        if options.effect + ending in load_manifest():
+            config, limits, weights = load_pretrained(options.effect + ending)
+            model = Model(weights, jax.random.key(options.seed))
+            networks[name] = config.network, limits, model
+    return networks
+
+
+def shade_frame(
+    options: Options,
+    settings: Settings,
+    mesh: Mesh,
+    light: Light,
+    carried: sequences.Carried,
+    networks: dict[str, Trained],
+) -> tuple[dict[str, np.ndarray], dict[str, Trained]]:
+    """All methods' images of a frame, the reference, its variance and the mask."""
+    samples, size = sequences.samples_at(mesh, carried), options.resolution
+    camera = orbit_camera(width=size, height=size)
+    given, stage, units = stage_of(options, settings, mesh, light, samples)
+    shot = compare.take_shot(stage, camera, settings, seed=options.seed)
+    truth = compare.trace(shot, settings, options.reference, seed=options.seed)
+    values = {"reference": truth.mean, "variance": truth.variance}
+    for picture in compare.screen_pictures(
+        compare.with_truth(shot, truth), camera, settings, units, repeats=1
+    ):
+        values[picture.row["method"]] = picture.values
+    for name, trained in networks.items():
+        values[name], networks[name] = compare.network_values(trained, given, shot)
+    mask = shot.gbuffer.mask
+    images = {n: evaluate_light.fill(mask, np.asarray(v)) for n, v in values.items()}
+    return images | {"mask": mask, "albedo": albedo_of(shot)}, networks
+
+
+def stage_of(
+    options: Options, settings: Settings, mesh: Mesh, light: Light, samples: Any
+) -> tuple[Any, Stage, np.ndarray | None]:
+    """What networks are given of a frame, the frame to be seen, the units of light."""
+    if isinstance(settings, Occlusion):
+        nothing = np.zeros(len(samples.position), np.float32)
+        points = ShadedPoints(samples.position, samples.normal, nothing, nothing)
+        return points, mesh, None
+    lit = light_mesh(mesh, light, settings, seed=options.seed)
+    cloud = lit_points(lit, samples, options.looks, seed=options.seed)
+    return cloud, lit, network_numbers(cloud)[1][..., 0].mean(axis=1)
+
+
+def albedo_of(shot: Shot) -> np.ndarray:
+    """What the transported light is multiplied by to be seen."""
+    mask = shot.gbuffer.mask
+    if isinstance(shot, View) or shot.pixels.medium.size:
+        return mask.astype(np.float32)
+    return evaluate_light.fill(mask, shot.pixels.albedo[shot.pixels.material])
+
+
+def measure(options: Options, frames: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Flicker and error of every method; draws the strip and the moving image."""
+    known = "reference", "variance", "mask", "albedo"
+    reference, variance, mask, albedo = (frames[name] for name in known)
+    unit = float(np.mean(reference[mask].astype(np.float64)) ** 2)
+    methods = [name for name in frames if name not in known]
+    rows = []
+    for name in methods:
+        images = frames[name]
+        error = (images.astype(np.float64) - reference) ** 2 - variance
+        change = sequences.flicker(images, reference, variance, mask)
+        error = float(error[mask].mean()) / unit
+        rows.append({"method": name, "flicker": change / unit, "mse_2d": error})
+    draw_strip(options.out, {n: frames[n] * albedo for n in (*methods, "reference")})
+    return {
+        "flicker": rows,
+        "options": {k: str(v) for k, v in asdict(options).items()},
+        "environment": report.environment(),
+    }
+
+
+def draw_strip(out: Path, frames: dict[str, np.ndarray]) -> None:
+    """strip.png, a row a method; animation.gif, all methods side by side."""
+    out.mkdir(parents=True, exist_ok=True)
+    reference = frames["reference"]
+    whole = reference.reshape(-1, *reference.shape[2:])
+    seen = compare_report.foreground(whole)
+
+    def shown(images: np.ndarray) -> np.ndarray:
+        flat = images.reshape(whole.shape)
+        return tone_map(flat, whole, seen).reshape(images.shape)
+
+    mapped = {name: shown(images) for name, images in frames.items()}
+    picks = np.linspace(0, len(reference) - 1, min(len(reference), 6)).astype(int)
+    size = (1.8 * len(picks), 1.9 * len(mapped))
+    figure = Figure(figsize=size, layout="constrained")
+    grid = np.atleast_2d(figure.subplots(len(mapped), len(picks), squeeze=False))
+    for line, (name, images) in zip(grid, mapped.items(), strict=True):
+        for axes, pick in zip(line, picks, strict=True):
+            axes.imshow(images[pick], cmap="gray", vmin=0, vmax=1)
+            axes.axis("off")
+        line[0].set_title(name, fontsize=8, loc="left")
+    figure.savefig(out / "strip.png", dpi=110)
+    side_by_side = np.concatenate(list(mapped.values()), axis=2)
+    moving = [Image.fromarray((255 * f).astype(np.uint8)) for f in side_by_side]
+    moving[0].save(
+        out / "animation.gif", save_all=True, append_images=moving[1:], duration=60
+    )
+
+
+def write_report(m: dict[str, Any]) -> str:
+    """report.md of an animation."""
+    options, env = m["options"], m["environment"]
+    columns = {"method": "method", "flicker": "flicker", "mse_2d": "2D MSE"}
+    name = "procedural" if options["animation"] == "None" else options["animation"]
+    return f"""# Animation, {options["effect"]}
+
+{Path(name).stem}, {options["frames"]} frames at {options["resolution"]} x
+{options["resolution"]}, reference of {options["reference"]} rays or paths a pixel.
+{env["processor"]}, {env["cores"]} cores.
+
+Flicker is the mean squared change from frame to frame that the reference does not have,
+over pixels seen in both; error and flicker are in units of the squared mean of the
+reference, its noise subtracted. Samples of the object move with their faces.
+
+{report.table_of(m["flicker"], columns)}
+![frames](strip.png)
+
+![moving](animation.gif)
+"""
+
+
+if __name__ == "__main__":
+    start(Options, main, QUICK, __doc__)

@@ -1,0 +1,328 @@
+"""Every method on the same pixels: tables, lost cells, error against run time.
+
+    python -m experiments.evaluate --effect gi --out runs/evaluate_gi
+
+compares the trained networks, full, 2D only and 3D only, with screen space, path
+tracing and (where mitsuba_oidn is installed) denoised path tracing, on scenes that no
+network was trained on. `--help` lists every option with its default.
+"""
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import numpy as np
+from rich.console import Console
+
+from ginn_jax import compare, compare_report, evaluate, evaluate_light, report
+from ginn_jax.camera import orbit_camera
+from ginn_jax.checkpoint import load_weights
+from ginn_jax.commandline import require, start
+from ginn_jax.compare import Picture, Shot, Trained
+from ginn_jax.evaluate import Model, Row
+from ginn_jax.experiment import make
+from ginn_jax.image import limits_at, with_disk_radius
+from ginn_jax.lighting import find_environments
+from ginn_jax.lit_clouds import LitCloud, network_numbers, split_points
+from ginn_jax.lit_experiment import UNSEEN_SEED
+from ginn_jax.lit_scenes import light_up
+from ginn_jax.mesh import find_meshes
+from ginn_jax.objects import (
+    Source,
+    file_lights,
+    file_sources,
+    load_object,
+    pair_up,
+    procedural_lights,
+    procedural_sources,
+)
+from ginn_jax.pretrained import load_pretrained
+from ginn_jax.scenes import Occlusion, Settings, cloud_origin
+
+NETWORKS = {compare_report.OURS: "", "2D only": "_only_2d", "3D only": "_only_3d"}
+TITLES = {"ao": "Ambient occlusion", "gi": "Global illumination"}
+TITLES |= {"sss": "Subsurface scattering"}
+TARGET_PATHS = 1024
+
+
+@dataclass(frozen=True)
+class Options:
+    """Compare all methods of an effect on unseen scenes."""
+
+    effect: Literal["ao", "gi", "sss"] = "ao"
+    """Ambient occlusion, global illumination or subsurface scattering."""
+    out: Path = Path("runs/evaluate")
+    """Folder for references, metrics.json, report.md and figures."""
+    checkpoint: Path | None = None
+    """The --out of a training run; left out, the weights that come with the package."""
+    only_2d: Path | None = None
+    """The same of the 2D-only network."""
+    only_3d: Path | None = None
+    """The same of the 3D-only network."""
+    meshes: Path | None = None
+    """A mesh file or a folder of unseen meshes; left out, procedural shapes."""
+    envmaps: Path | None = None
+    """An environment map or a folder of unseen ones; left out, procedural skies."""
+    objects: int = 5
+    """How many scenes, evenly spread over the meshes."""
+    views: int = 5
+    """Cameras around each."""
+    resolution: int = 512
+    """Side of the images in pixels."""
+    reference: int = 256
+    """Rays or paths per pixel of the reference."""
+    counts: tuple[int, ...] = (1, 4, 16, 64)
+    """Rays or paths per pixel of the traced rivals."""
+    disks: tuple[float, ...] = (0.015, 0.03)
+    """Poisson disk radii at which our network runs beside its own."""
+    points: int = 20_000
+    """Samples per object; a fifth of them measure, the others are given."""
+    radius: float = 0.1
+    """Occlusion radius."""
+    seed: int = 0
+    """Seed of everything."""
+    quick: bool = False
+    """One small view of one scene: to try things, not for numbers."""
+
+
+QUICK = {"objects": 1, "views": 1, "resolution": 64, "reference": 16, "points": 4000}
+QUICK |= {"counts": (1, 4), "disks": ()}
+
+
+def main(options: Options) -> dict[str, Any]:
+    """Run the comparison; returns what metrics.json holds."""
+    least = {"objects": 1, "views": 1, "resolution": 32, "reference": 2, "seed": 0}
+    require(options, least | {"points": 1000})
+    console = Console()
+    targets = 64 if options.quick else TARGET_PATHS
+    given = options.effect, options.points, targets, options.radius
+    settings = compare.effect_settings(*given)
+    sources = choose_sources(options)
+    networks = load_networks(options)
+    if not isinstance(settings, Occlusion):
+        settings = replace(settings, targets=options.points // 5)
+    clouds = make(console, "clouds", sources, settings, options.out / "clouds")
+    at_points, networks = errors_at_points(networks, clouds, sources, settings)
+    rows, front_rows, shown = [], [], []
+    for source, cloud in zip(sources, clouds, strict=True):
+        console.print(f"{source.name}")
+        found = compare_scene(options, settings, source, cloud, networks)
+        rows += found[0]
+        front_rows += found[1]
+        shown.append((source.name, found[2]))
+        networks = found[3]
+    metrics = summary(options, at_points, rows, front_rows, [s.name for s in sources])
+    compare_report.draw_methods(options.out / "ablation.png", shown[:4])
+    draw_front(options.out / "error_against_time.png", metrics["error_against_time"])
+    title = TITLES[options.effect]
+    report.write_results(
+        options.out, metrics, compare_report.write_report(title, metrics)
+    )
+    lost = len(metrics["lost_cells"])
+    console.print(f"{lost} cells lost: {options.out / 'report.md'}")
+    return metrics
+
+
+def choose_sources(options: Options) -> list[Source]:
+    """Unseen objects, under unseen lights where the effect has light."""
+    seed = UNSEEN_SEED + options.seed
+    objects = (
+        procedural_sources(options.objects, seed)
+        if options.meshes is None
+        else file_sources(find_meshes(options.meshes))
+    )
+    step = max(len(objects) // options.objects, 1)
+    objects = objects[::step][: options.objects]
+    if options.effect == "ao":
+        return objects
+    lights = (
+        procedural_lights(options.objects, seed)
+        if options.envmaps is None
+        else file_lights(find_environments(options.envmaps))
+    )
+    step = max(len(lights) // options.objects, 1)
+    return pair_up(objects, lights[::step], 1)
+
+
+def load_networks(options: Options) -> dict[str, Trained]:
+    """The three networks of the effect."""
+    runs = options.checkpoint, options.only_2d, options.only_3d
+    networks: dict[str, Trained] = {}
+    for (name, ending), run in zip(NETWORKS.items(), runs, strict=True):
+        pretrained = options.effect + ending
+        config, limits, weights = (
+            load_pretrained(pretrained) if run is None else load_weights(run)
+        )
+        model = Model(weights, jax.random.key(options.seed))
+        networks[name] = config.network, limits, model
+    return networks
+
+
+def errors_at_points(
+    networks: dict[str, Trained],
+    clouds: list[Any],
+    sources: list[Source],
+    settings: Settings,
+) -> tuple[dict[str, Row], dict[str, Trained]]:
+    """3D errors of every network, and the networks with the limits they took."""
+    names, found = [s.name for s in sources], {}
+    for name, (network, limits, model) in networks.items():
+        given = network, limits, model, clouds, names
+        if isinstance(settings, Occlusion):
+            rows, limits = evaluate.evaluate_clouds(*given, settings.rays)
+            found[name] = evaluate.pool_rows(rows)
+        else:
+            rows, limits = evaluate_light.evaluate_lit_clouds(*given, settings)
+            found[name] = evaluate_light.pool_lit_rows(rows)
+        networks[name] = network, limits, model
+    return found, networks
+
+
+def compare_scene(
+    options: Options,
+    settings: Settings,
+    source: Source,
+    cloud: Any,
+    networks: dict[str, Trained],
+) -> tuple[list[Row], list[Row], dict[str, np.ndarray], dict[str, Trained]]:
+    """All methods on all views of a scene.
+
+    Rows of the table, rows of error against run time, pictures of the first view.
+    """
+    stage = (
+        load_object(source)
+        if isinstance(settings, Occlusion)
+        else light_up(source, settings)
+    )
+    given, units = points_given(cloud)
+    rows, front, shown = [], [], {}
+    for view in range(options.views):
+        azimuth = 35.0 + 360.0 * view / options.views
+        size = options.resolution
+        camera = orbit_camera(azimuth, width=size, height=size)
+        shot = compare.take_shot(stage, camera, settings, seed=source.seed)
+        extra = {"reference": options.reference, "size": size, "azimuth": azimuth}
+        path = options.out / "references" / f"{source.name}_{size}_{view}.npz"
+        origin = cloud_origin(source, settings) | extra
+        shot = compare.with_reference(
+            shot, settings, options.reference, path, origin, seed=source.seed
+        )
+        pictures = compare.screen_pictures(shot, camera, settings, units)
+        for name, trained in networks.items():
+            picture, networks[name] = compare.network_picture(
+                name, trained, given, shot
+            )
+            pictures.append(picture)
+        rows += [p.row | {"name": source.name, "view": view} for p in pictures]
+        if view == 0:
+            shown = displayed(shot, pictures)
+            front += [p.row for p in pictures]
+            front += rivals(options, settings, shot, given, networks, units)
+    return rows, front, shown, networks
+
+
+def points_given(cloud: Any) -> tuple[Any, np.ndarray | None]:
+    """The part of a cloud that networks are given, and the units of its light."""
+    count = len(cloud.position) * 4 // 5
+    if not isinstance(cloud, LitCloud):
+        return evaluate.split_cloud(cloud, count)[0], None
+    given = split_points(cloud, count)[0]
+    return given, network_numbers(given)[1][..., 0].mean(axis=1)
+
+
+def rivals(
+    options: Options,
+    settings: Settings,
+    shot: Shot,
+    given: Any,
+    networks: dict[str, Trained],
+    units: np.ndarray | None,
+) -> list[Row]:
+    """Our network at other rates and radii, and tracing, plain and denoised."""
+    network, limits, model = networks[compare_report.OURS]
+    picture, networks[compare_report.OURS] = compare.network_picture(
+        "ours, scale 0.5", networks[compare_report.OURS], given, shot, 0.5
+    )
+    rows = [picture.row]
+    for radius in options.disks:
+        variant = with_disk_radius(network, radius)
+        trained = variant, limits_at(network, limits, radius), model
+        name = f"ours, disk {radius:g}"
+        rows.append(compare.network_picture(name, trained, given, shot)[0].row)
+    for count in options.counts:
+        seed = 1_000_003 + options.seed
+        noisy = compare.traced_picture(shot, settings, count, units, seed=seed)
+        rows.append(noisy.row)
+        if denoised := compare.denoised_picture(shot, noisy, units):
+            rows.append(denoised.row)
+    return rows
+
+
+def displayed(shot: Shot, pictures: list[Picture]) -> dict[str, np.ndarray]:
+    """What the methods show, and the reference."""
+    values = {p.row["method"]: p.values for p in pictures}
+    values["reference"] = compare.target_of(shot)
+    if isinstance(shot, evaluate.View):
+        mask = shot.gbuffer.mask
+        return {name: evaluate_light.fill(mask, v) for name, v in values.items()}
+    return {name: evaluate_light.displayed(shot, v) for name, v in values.items()}
+
+
+def summary(
+    options: Options,
+    at_points: dict[str, Row],
+    rows: list[Row],
+    front_rows: list[Row],
+    names: list[str],
+) -> dict[str, Any]:
+    """What metrics.json holds."""
+    results = compare_report.pool_shots(rows)
+    for row in results:
+        row |= {k: at_points.get(row["method"], {}).get(k, "-") for k in KEPT}
+    front = compare_report.pool_shots(front_rows)
+    ours = next(r for r in results if r["method"] == compare_report.OURS)
+    units = "" if options.effect == "ao" else UNITS
+    return {
+        "results": results,
+        "lost_cells": compare_report.lost_cells(results),
+        "error_against_time": front,
+        "front_mse": compare_report.pareto_front(front),
+        "front_dssim": compare_report.pareto_front(front, "dssim_2d"),
+        "share_2d": ours["seconds_2d"] / ours["seconds"],
+        "denoiser": any("denoised" in row for row in front),
+        "objects": len(names),
+        "names": names,
+        "units": units or "Errors are of openness, 1 where nothing is near.",
+        "rows": rows,
+        "front_rows": front_rows,
+        "options": {k: str(v) for k, v in asdict(options).items()},
+        "environment": report.environment(),
+        "peak_memory_gib": report.peak_memory_gib(),
+    }
+
+
+KEPT = ("mse_3d", "relative_mse_3d", "equal_rays")
+UNITS = (
+    "MSE is of the transported light, in units of the squared mean light of each scene "
+    "and channel."
+)
+
+
+def draw_front(path: Path, rows: list[Row]) -> None:
+    """Error against run time, one line a kind of method."""
+    groups = {
+        "ours": [r for r in rows if r["method"].startswith(compare_report.OURS)],
+        "ablations": [r for r in rows if r["method"] in ("2D only", "3D only")],
+        "screen space": [
+            r for r in rows if r["method"] in ("screen space", "visibility bitmask")
+        ],
+        "traced": [r for r in rows if "traced" in r],
+        "traced and denoised": [r for r in rows if "denoised" in r],
+    }
+    kept = {name: group for name, group in groups.items() if group}
+    report.draw_error_against_time(path, kept)
+
+
+if __name__ == "__main__":
+    start(Options, main, QUICK, __doc__)

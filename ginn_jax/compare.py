@@ -1,0 +1,251 @@
+"""Every method on the same pixels: networks, screen space, path tracing, denoising.
+
+A shot is one scene under one camera, of ambient occlusion (`View`) or of light
+(`LitView`). A method makes a picture of it: a row of numbers and the foreground values.
+"""
+
+import importlib
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from ginn_jax import evaluate, evaluate_light
+from ginn_jax.architecture import Network
+from ginn_jax.camera import Camera
+from ginn_jax.dataset import ShadedPoints, load_arrays, save_arrays
+from ginn_jax.errors import InputError
+from ginn_jax.evaluate import Model, Row, View, timed
+from ginn_jax.evaluate_light import LitView
+from ginn_jax.geometry import Limits
+from ginn_jax.image import encode_cloud, shade_points, within_range
+from ginn_jax.irradiance import ColorEstimate
+from ginn_jax.lit_clouds import LitCloud, network_numbers
+from ginn_jax.lit_scenes import Illumination, Lit, Scattering
+from ginn_jax.mesh import Mesh
+from ginn_jax.reference import Estimate
+from ginn_jax.scenes import Occlusion, Settings
+from ginn_jax.screen_bounce import bitmask_irradiance, indirect_irradiance
+from ginn_jax.screen_occlusion import ambient_occlusion, bitmask_occlusion
+from ginn_jax.screen_scattering import radiant_exitance
+
+Shot = View | LitView
+Stage = Mesh | Lit
+Trained = tuple[Network, Limits, Model]
+Truth = Estimate | ColorEstimate
+Values = Float[np.ndarray, "P *C"]
+
+
+class Picture(NamedTuple):
+    """What a method made of a shot: numbers, and values of the foreground."""
+
+    row: Row
+    values: Values
+
+
+def take_shot(stage: Stage, camera: Camera, settings: Settings, *, seed: int) -> Shot:
+    """A scene seen by a camera, with no reference yet."""
+    if isinstance(stage, Mesh):
+        return evaluate.frame(stage, camera)
+    assert not isinstance(settings, Occlusion)
+    return evaluate_light.lit_frame(stage, camera, settings, seed=seed)
+
+
+def trace(shot: Shot, settings: Settings, count: int, *, seed: int) -> Truth:
+    """Ray or path tracing of the pixels with `count` each."""
+    if isinstance(shot, View):
+        assert isinstance(settings, Occlusion)
+        return evaluate.traced(shot, settings.radius, count, seed=seed)
+    return evaluate_light.traced(shot, count, seed=seed)
+
+
+def with_reference(
+    shot: Shot, settings: Settings, count: int, path: Path, origin: Row, *, seed: int
+) -> Shot:
+    """The shot with its reference, traced once and kept at `path`."""
+    try:
+        found = load_arrays(path, origin)
+    except InputError:
+        truth = trace(shot, settings, count, seed=seed)
+        found = {"mean": truth.mean, "variance": truth.variance}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_arrays(path, found, origin)
+    kind = Estimate if isinstance(shot, View) else ColorEstimate
+    return with_truth(shot, kind(**found))
+
+
+def with_truth(shot: Shot, truth: Truth) -> Shot:
+    """The shot with a reference."""
+    if isinstance(shot, View):
+        assert isinstance(truth, Estimate)
+        return evaluate.with_truth(shot, truth)
+    assert isinstance(truth, ColorEstimate)
+    return evaluate_light.with_truth(shot, truth)
+
+
+def target_of(shot: Shot) -> Values:
+    """The reference of the foreground pixels."""
+    if isinstance(shot, View):
+        return shot.reference[shot.gbuffer.mask]
+    return shot.pixels.target
+
+
+def errors(shot: Shot, values: Values, units: Float[np.ndarray, "C"] | None) -> Row:
+    """2D errors of a picture; `units` are those of the light, see `evaluate_light`."""
+    if isinstance(shot, View):
+        mask, noise = shot.gbuffer.mask, float(np.mean(shot.variance))
+        row = evaluate.image_errors(shot, evaluate.fill(mask, values))
+        row["variance_2d"] = float(np.var(shot.reference[mask])) - noise
+    else:
+        assert units is not None
+        row = evaluate_light.lit_image_errors(shot, values, units)
+    return row | {"relative_mse_2d": row["mse_2d"] / row["variance_2d"]}
+
+
+def network_picture(
+    name: str,
+    trained: Trained,
+    cloud: ShadedPoints | LitCloud,
+    shot: Shot,
+    scale: float = 1.0,
+) -> tuple[Picture, Trained]:
+    """A network's picture, and the network with the limits that it took."""
+    network, limits, model = trained
+    given = network, limits, model, cloud, shot, scale
+    if isinstance(shot, View):
+        row, image, limits = evaluate.network_row(*given)  # type: ignore[arg-type]
+        values, units = image[shot.gbuffer.mask], None
+    else:
+        row, values, encoded, limits = evaluate_light.lit_network_row(*given)  # type: ignore[arg-type]
+        units = np.asarray(encoded.scale)
+    row |= {"method": name} | errors(shot, values, units)
+    return Picture(row, values), (network, limits, model)
+
+
+def network_values(
+    trained: Trained, cloud: ShadedPoints | LitCloud, shot: Shot
+) -> tuple[Values, Trained]:
+    """What a network makes of the pixels, not timed."""
+    network, limits, model = trained
+    given = network, limits, model.variables
+    mask = shot.gbuffer.mask
+    pixels = shot.gbuffer.position[mask], shot.gbuffer.normal[mask]
+    if isinstance(cloud, ShadedPoints):
+        ends = cloud.position, cloud.normal
+        encoded, limits = encode_cloud(*given, *ends, key=model.key)
+        values, limits = shade_points(
+            network, limits, model.variables, encoded, *pixels
+        )
+    else:
+        assert isinstance(shot, LitView)
+        encoded, limits = evaluate_light.encode_lit(network, limits, model, cloud)
+        numbers = network_numbers(shot.pixels)
+        values, limits = shade_points(
+            network, limits, model.variables, encoded, *pixels, *numbers
+        )
+    return within_range(encoded, values), (network, limits, model)
+
+
+def screen_pictures(
+    shot: Shot, camera: Camera, settings: Settings, units: Any, repeats: int = 3
+) -> list[Picture]:
+    """What screen-space methods make of the G-buffer."""
+    mask, found = shot.gbuffer.mask, []
+    for name, method in screen_methods(shot, camera, settings).items():
+        compiled = jax.jit(method).lower().compile()
+        image, _, seconds = timed(compiled, repeats)
+        values = np.asarray(image)[mask]
+        memory = compiled.memory_analysis()
+        row = {"method": name, "seconds": seconds} | errors(shot, values, units)
+        row["memory_mib"] = (memory.temp_size_in_bytes) / 2**20
+        found.append(Picture(row, values))
+    return found
+
+
+def screen_methods(shot: Shot, camera: Camera, settings: Settings) -> dict[str, Any]:
+    """The screen-space methods of the effect, by name, ready to be called."""
+    position, normal, _, mask = shot.gbuffer
+    surface = position, normal, mask
+    if isinstance(shot, View):
+        assert isinstance(settings, Occlusion)
+        radius = settings.radius
+        return {
+            "screen space": partial(ambient_occlusion, *surface, camera, radius),
+            "visibility bitmask": partial(bitmask_occlusion, *surface, camera, radius),
+        }
+    pixels = shot.pixels
+    irradiance = evaluate_light.fill(mask, pixels.irradiance)
+    if isinstance(settings, Scattering):
+        extinction, ior = (float(x) for x in pixels.medium)
+        medium = {"albedo": pixels.albedo[0], "extinction": extinction, "ior": ior}
+        given = *surface, irradiance, camera
+        return {"screen space": partial(radiant_exitance, *given, **medium)}
+    albedo = evaluate_light.fill(mask, pixels.albedo[pixels.material])
+    given = *surface, albedo * irradiance, camera
+    return {
+        "screen space": partial(indirect_irradiance, *given),
+        "visibility bitmask": partial(bitmask_irradiance, *given),
+    }
+
+
+def traced_picture(
+    shot: Shot, settings: Settings, count: int, units: Any, *, seed: int
+) -> Picture:
+    """Ray or path tracing with so many rays or paths a pixel."""
+    work = partial(trace, shot, settings, count, seed=seed)
+    truth, _, seconds = timed(work, repeats=1)
+    what = "rays" if isinstance(shot, View) else "paths"
+    row = {"method": f"{count} {what}", "traced": count, "seconds": seconds}
+    return Picture(row | errors(shot, truth.mean, units), truth.mean)
+
+
+def denoised_picture(shot: Shot, noisy: Picture, units: Any) -> Picture | None:
+    """A traced picture after Open Image Denoise, guided by albedo and normals.
+
+    None where the optional package `mitsuba_oidn` is not installed.
+    """
+    try:
+        denoise = importlib.import_module("mitsuba_oidn").denoise
+    except ImportError:
+        return None
+    gbuffer = shot.gbuffer
+    mask, (color, albedo) = gbuffer.mask, denoiser_inputs(shot, noisy.values)
+    guides = {"albedo": albedo, "normal": gbuffer.normal.astype(np.float32)}
+    hdr = isinstance(shot, LitView)
+    work = partial(denoise, color, **guides, hdr=hdr, clean_aux=True)
+    image, _, seconds = timed(work)
+    image = np.asarray(image)
+    values = (image[..., 0] if isinstance(shot, View) else image)[mask]
+    row = {
+        "method": f"{noisy.row['method']}, denoised",
+        "denoised": noisy.row["traced"],
+        "seconds": noisy.row["seconds"] + seconds,
+    }
+    return Picture(row | errors(shot, values, units), values)
+
+
+def denoiser_inputs(
+    shot: Shot, values: Values
+) -> tuple[Float[np.ndarray, "H W 3"], Float[np.ndarray, "H W 3"]]:
+    """Noisy image and albedo, in colour; the transported light, as the networks' is."""
+    mask = shot.gbuffer.mask
+    if isinstance(shot, View):
+        gray = evaluate.fill(mask, values)
+        color = np.repeat(gray[..., None], 3, axis=2)
+        return color, evaluate_light.fill(mask, np.ones((len(values), 3), np.float32))
+    albedo = shot.pixels.albedo[shot.pixels.material].astype(np.float32)
+    color = evaluate_light.fill(mask, values)
+    return color, evaluate_light.fill(mask, albedo)
+
+
+def effect_settings(effect: str, points: int, paths: int, radius: float) -> Settings:
+    """The settings of an effect by its short name."""
+    kinds: dict[str, Any] = {
+        "ao": partial(Occlusion, radius=radius),
+        "gi": Illumination,
+        "sss": Scattering,
+    }
+    return kinds[effect](points, paths)

@@ -1,0 +1,131 @@
+"""Trained networks that come with the package: one .npz of weights each, a manifest.
+
+The arrays carry their place in the tree as a name and need nothing but NumPy to read;
+`manifest.json` says of each network how it was trained, on what, and how good it is.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from ginn_jax.checkpoint import check_names, load_weights, training_from
+from ginn_jax.dataset import load_arrays, save_arrays
+from ginn_jax.errors import InputError
+from ginn_jax.geometry import Limits
+from ginn_jax.network import Variables
+from ginn_jax.train import Training, state_shapes
+
+FOLDER = Path(__file__).parent / "weights"
+MANIFEST = "manifest.json"
+Record = dict[str, Any]
+
+
+def load_manifest(folder: Path = FOLDER) -> dict[str, Record]:
+    """What there is, by name, and how each came to be.
+
+    Raises:
+        InputError: no manifest there, or a damaged one.
+    """
+    path = folder / MANIFEST
+    try:
+        found = json.loads(path.read_text())
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError):
+        raise InputError(f"{path} is damaged: install the package again") from None
+    return found
+
+
+def load_pretrained(
+    name: str, folder: Path = FOLDER
+) -> tuple[Training, Limits, Variables]:
+    """Configuration, capacities and weights of "ao", "gi", "sss", and of ablations.
+
+    Raises:
+        InputError: no network of that name, or a damaged file.
+    """
+    manifest = load_manifest(folder)
+    if name not in manifest:
+        known = ", ".join(sorted(manifest)) or "none"
+        raise InputError(f"no trained network {name!r}: there are {known}")
+    try:
+        config = training_from(manifest[name]["training"])
+        limits = Limits(tuple((k, int(v)) for k, v in manifest[name]["limits"].items()))
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise InputError(
+            f"{folder / MANIFEST} is damaged at {name}: install the package again"
+        ) from None
+    check_names(folder / MANIFEST, config.network, limits)
+    return config, limits, read_weights(folder / f"{name}.npz", config)
+
+
+def read_weights(path: Path, config: Training) -> Variables:
+    """The weights of a network from their file.
+
+    Raises:
+        InputError: a missing or damaged file, or one of another network.
+    """
+    found = load_arrays(path, None)
+    leaves, tree = jax.tree.flatten_with_path(state_shapes(config).variables)
+    wanted = {place(keys): leaf.shape for keys, leaf in leaves}
+    if wanted != {name: array.shape for name, array in found.items()}:
+        raise InputError(f"{path} holds another network: install the package again")
+    values = [np.asarray(found[name], np.float32) for name in wanted]
+    if not all(np.isfinite(value).all() for value in values):
+        raise InputError(f"{path} holds weights that are not finite: train again")
+    return jax.tree.unflatten(tree, [jax.numpy.asarray(value) for value in values])
+
+
+def place(keys: Any) -> str:
+    """Where an array stands in its tree, as a name."""
+    return jax.tree_util.keystr(keys, simple=True, separator="/")
+
+
+def export(run: Path, name: str, more: Record, folder: Path = FOLDER) -> Path:
+    """Write the weights of a finished run into `folder`, with a record of the run.
+
+    Raises:
+        InputError: no finished run there.
+    """
+    _, limits, variables = load_weights(run)
+    try:
+        metrics = json.loads((run / "metrics.json").read_text())
+    except (OSError, ValueError):
+        raise InputError(f"{run} holds no metrics.json: let its run finish") from None
+    folder.mkdir(parents=True, exist_ok=True)
+    leaves, _ = jax.tree.flatten_with_path(variables)
+    arrays = {place(keys): np.asarray(leaf) for keys, leaf in leaves}
+    save_arrays(folder / f"{name}.npz", arrays, {"name": name})
+    manifest = load_manifest(folder)
+    manifest[name] = record_of(run, metrics, limits) | more
+    text = json.dumps(manifest, indent=1, sort_keys=True) + "\n"
+    temporary = folder / f"{MANIFEST}.partial"
+    temporary.write_text(text)
+    temporary.replace(folder / MANIFEST)
+    return folder / f"{name}.npz"
+
+
+def record_of(run: Path, metrics: Record, limits: Limits) -> Record:
+    """What the manifest says of a run; paths are of whoever trained, so left out."""
+    made = json.loads((run / "run.json").read_text())
+    names = ("relative_mse_3d", "median_relative_mse_3d", "equal_rays", "clouds")
+    pooled = {"unseen shapes": metrics} | {
+        key: value
+        for key, value in metrics.items()
+        if key.startswith("unseen") and isinstance(value, dict)
+    }
+    return {
+        "training": made["training"],
+        "limits": dict(limits.sizes),
+        "data": made.get("data", made.get("occlusion")),
+        "objects": len(made["objects"]),
+        "errors": {
+            key: {name: value[name] for name in names} for key, value in pooled.items()
+        },
+        "steps": metrics["steps"],
+        "seed": made["training"]["seed"],
+        "packages": metrics["environment"]["packages"],
+    }

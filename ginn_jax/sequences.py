@@ -1,0 +1,140 @@
+"""Animated meshes: one topology, a position of every vertex in every frame.
+
+Samples are taken once and move with their faces, so that what changes from frame to
+frame is the scene and not the sampling.
+"""
+
+import zipfile
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int
+
+from ginn_jax.errors import InputError
+from ginn_jax.lit_scenes import FAR, PROBE_RAYS
+from ginn_jax.mesh import Mesh, Samples, add_ground, fit_unit_box
+from ginn_jax.reference import ambient_occlusion, build_scene
+from ginn_jax.shapes import random_shape
+
+
+class Animation(NamedTuple):
+    """Vertices of every frame, and the faces that they share."""
+
+    vertices: Float[np.ndarray, "T V 3"]
+    faces: Int[np.ndarray, "F 3"]
+
+
+class Carried(NamedTuple):
+    """Samples by their face and where they lie in it."""
+
+    face: Int[np.ndarray, "N"]
+    barycentric: Float[np.ndarray, "N 3"]
+
+
+def load_animation(path: Path) -> Animation:
+    """An animation from an .npz of `vertices` [T V 3] and `faces` [F 3].
+
+    Raises:
+        InputError: no such file, another kind of file, or numbers that make no mesh.
+    """
+    try:
+        with np.load(path) as file:
+            vertices, faces = file["vertices"], file["faces"]
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such animation") from None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        raise InputError(
+            f"{path}: not an .npz of vertices [T V 3] and faces [F 3]"
+        ) from None
+    whole = vertices.ndim == 3 and faces.ndim == 2 and len(vertices) > 1
+    if not (whole and vertices.shape[2] == 3 and faces.shape[1] == 3):
+        raise InputError(f"{path}: give vertices [T V 3], two frames up, faces [F 3]")
+    if not (np.isfinite(vertices).all() and faces.min() >= 0):
+        raise InputError(f"{path}: vertices are not finite, or faces negative")
+    if faces.max() >= vertices.shape[1]:
+        raise InputError(f"{path}: a face names a vertex that is not there")
+    return Animation(vertices.astype(np.float32), faces.astype(np.int32))
+
+
+def procedural_animation(seed: int, frames: int) -> Animation:
+    """A procedural shape that sways: it leans over and back and turns a little."""
+    mesh = fit_unit_box(random_shape(seed))
+    phase = 2 * np.pi * np.arange(frames)[:, None] / frames
+    x, y, z = mesh.vertices.T.astype(np.float64)
+    height = y - y.min()
+    turn = 0.5 * np.sin(phase) * height
+    swayed = x + 0.3 * np.sin(phase) * height**2
+    c, s = np.cos(turn), np.sin(turn)
+    lift = np.broadcast_to(y, swayed.shape)
+    vertices = np.stack([c * swayed + s * z, lift, c * z - s * swayed], axis=2)
+    return Animation(vertices.astype(np.float32), mesh.faces)
+
+
+def frames_of(animation: Animation, count: int, ground: bool) -> list[Mesh]:
+    """`count` consecutive frames, all in the unit box of the whole animation.
+
+    The ground, if any, lies under the lowest vertex of all frames.
+    """
+    places, faces = animation
+    low, high = places.min(axis=(0, 1)), places.max(axis=(0, 1))
+    scale = float((high - low).max())
+    if not scale > 0:
+        raise InputError("animation: all vertices coincide; give one of some extent")
+    places = ((places - (low + high) / 2) / scale).astype(np.float32)
+    material = np.zeros(len(faces), np.int32)
+    meshes = [Mesh(place, faces, material) for place in places[:count]]
+    if not ground:
+        return meshes
+    floor = Mesh(places[places[..., 1].min(axis=1).argmin()], faces, material)
+    base = add_ground(floor)
+    return [
+        base._replace(vertices=np.concatenate([place, base.vertices[-4:]]))
+        for place in places[:count]
+    ]
+
+
+def carried_samples(mesh: Mesh, count: int, *, seed: int) -> Carried:
+    """Uniform samples of a frame that light can reach, to be carried to the others."""
+    shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    place, face = trimesh.sample.sample_surface(shape, 2 * count, seed=seed)[:2]
+    corners = mesh.vertices[mesh.faces[face]]
+    barycentric = trimesh.triangles.points_to_barycentric(corners, place)
+    carried = Carried(face.astype(np.int32), barycentric.astype(np.float32))
+    samples = samples_at(mesh, carried)
+    ends = samples.position, samples.normal
+    sky = ambient_occlusion(build_scene(mesh), *ends, FAR, rays=PROBE_RAYS, seed=seed)
+    seen = np.flatnonzero(sky.mean > 0)[:count]
+    if len(seen) < count:
+        raise InputError("more than half of the surface is sealed inside: mend it")
+    return Carried(*(a[seen] for a in carried))
+
+
+def samples_at(mesh: Mesh, carried: Carried) -> Samples:
+    """Where carried samples are in another frame."""
+    corners = mesh.vertices[mesh.faces[carried.face]]
+    position = np.einsum("nk,nkd->nd", carried.barycentric, corners)
+    a, b, c = corners.transpose(1, 0, 2).astype(np.float64)
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = normal / np.where(length > 0, length, 1.0)
+    material = mesh.material[carried.face].astype(np.int32)
+    return Samples(position.astype(np.float32), normal.astype(np.float32), material)
+
+
+def flicker(
+    images: Float[np.ndarray, "T P *C"],
+    reference: Float[np.ndarray, "T P *C"],
+    variance: Float[np.ndarray, "T P *C"],
+    seen: Float[np.ndarray, "T P"] | np.ndarray,
+) -> float:
+    """Mean squared frame-to-frame change that the reference does not have.
+
+    Over pixels seen in both frames; the noise of the reference is subtracted.
+    """
+    change = np.diff(images.astype(np.float64), axis=0)
+    right = np.diff(reference.astype(np.float64), axis=0)
+    noise = variance[1:].astype(np.float64) + variance[:-1]
+    both = seen[1:] & seen[:-1]
+    return float(((change - right) ** 2 - noise)[both].mean())

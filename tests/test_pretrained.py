@@ -1,0 +1,94 @@
+"""Trained networks that come with the package: they load, and are the ones measured."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+import tiny
+
+from experiments.export import effect_of, fixed_scene_error
+from ginn_jax import checkpoint, fit, pretrained
+from ginn_jax.errors import InputError
+from ginn_jax.evaluate import Model
+
+MANIFEST = pretrained.load_manifest()
+FULL = [name for name in ("ao", "gi", "sss") if name in MANIFEST]
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """A folder with the untrained tiny network under the name "ao"."""
+    run, folder = (tmp_path_factory.mktemp(n) for n in ("run", "weights"))
+    state = tiny.fresh_state()
+    checkpoint.save_run(run, tiny.CONFIG, tiny.LIMITS, {"objects": [], "data": {}})
+    manager = checkpoint.open_manager(run, fresh=True)
+    checkpoint.save_state(manager, state)
+    manager.close()
+    fit.save_losses(run, [0.0])
+    pooled = {"relative_mse_3d": 0.5, "median_relative_mse_3d": 0.5}
+    pooled |= {"equal_rays": 1.0, "clouds": 1}
+    metrics = pooled | {"steps": 0, "environment": {"packages": {}}}
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    pretrained.export(run, "ao", {"command": "none"}, folder)
+    return folder, state
+
+
+def test_weights_come_back_bit_for_bit(exported):
+    folder, state = exported
+    config, limits, weights = pretrained.load_pretrained("ao", folder)
+    assert (config, limits) == (tiny.CONFIG, tiny.LIMITS)
+    assert tiny.identical(weights, jax.device_get(state.variables))
+    assert pretrained.load_manifest(folder)["ao"]["errors"]
+
+
+def test_unknown_names_and_damaged_files_are_told(exported, tmp_path):
+    folder, _ = exported
+    with pytest.raises(InputError, match=r"'water'.*there are ao"):
+        pretrained.load_pretrained("water", folder)
+    with pytest.raises(InputError, match="there are none"):
+        pretrained.load_pretrained("ao", tmp_path)
+    manifest = (folder / pretrained.MANIFEST).read_text()
+    (tmp_path / pretrained.MANIFEST).write_text(manifest)
+    with pytest.raises(InputError, match="no such"):
+        pretrained.load_pretrained("ao", tmp_path)
+    whole = (folder / "ao.npz").read_bytes()
+    (tmp_path / "ao.npz").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match="damaged"):
+        pretrained.load_pretrained("ao", tmp_path)
+    (tmp_path / pretrained.MANIFEST).write_text(manifest[:-20])
+    with pytest.raises(InputError, match="damaged"):
+        pretrained.load_pretrained("ao", tmp_path)
+
+
+def test_weights_of_another_network_or_not_finite_are_refused(exported, tmp_path):
+    folder, _ = exported
+    with np.load(folder / "ao.npz") as file:
+        arrays = dict(file)
+    name = next(n for n in arrays if n != "origin")
+    (tmp_path / pretrained.MANIFEST).write_bytes(
+        (folder / pretrained.MANIFEST).read_bytes()
+    )
+    np.savez(tmp_path / "ao.npz", **(arrays | {name: arrays[name][:-1]}))
+    with pytest.raises(InputError, match="another network"):
+        pretrained.load_pretrained("ao", tmp_path)
+    np.savez(tmp_path / "ao.npz", **(arrays | {name: np.nan * arrays[name]}))
+    with pytest.raises(InputError, match="not finite"):
+        pretrained.load_pretrained("ao", tmp_path)
+
+
+def test_every_network_of_the_manifest_loads_and_is_small():
+    for name, record in MANIFEST.items():
+        config, _, weights = pretrained.load_pretrained(name)
+        assert config.steps == record["steps"]
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(weights))
+        assert (pretrained.FOLDER / f"{name}.npz").stat().st_size < 2e6
+
+
+@pytest.mark.parametrize("name", FULL)
+def test_the_error_on_the_fixed_scene_is_the_stored_one(name):
+    config, limits, weights = pretrained.load_pretrained(name)
+    model = Model(weights, jax.random.key(0))
+    error = fixed_scene_error(effect_of(name), config.network, limits, model)
+    stored = MANIFEST[name]["fixed_scene_relative_mse_3d"]
+    assert error == pytest.approx(stored, rel=0.05)
