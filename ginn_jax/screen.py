@@ -132,17 +132,19 @@ def look_up(
     table: Float[Array, "P 3"],
     column: Float[Array, "H W"],
     row: Float[Array, "H W"],
-) -> tuple[Float[Array, "H W"], Int[Array, "H W"]]:
-    """1 / z at any place of the image (0: nothing), and its pixel's place in a table.
+) -> tuple[Float[Array, "H W"], Float[Array, "H W 3"], Int[Array, "H W"]]:
+    """1 / z at any place of the image (0: nothing), its change, its place in a table.
 
-    Whole numbers are pixel centres; a table is what `framed` makes.
+    Whole numbers are pixel centres; a table is what `framed` makes. The change is per
+    column and row, with a third component of 0.
     """
     height, width = column.shape
     j = jnp.clip(jnp.round(column), -1, width)
     i = jnp.clip(jnp.round(row), -1, height)
     place = ((i + 1) * (width + 2) + j + 1).astype(jnp.int32)
     nearness, across, down = jnp.moveaxis(table[place], -1, 0)
-    return nearness + across * (column - j) + down * (row - i), place
+    nearness = nearness + across * (column - j) + down * (row - i)
+    return nearness, jnp.stack([across, down, jnp.zeros_like(down)], -1), place
 
 
 def pixel_places(
@@ -158,3 +160,4 @@ def gradient_noise(shape: tuple[int, int]) -> Float[np.ndarray, "H W"]:
     columns, rows = np.indices(shape)[::-1].astype(np.float64)
     inner = (0.06711056 * columns + 0.00583715 * rows) % 1
     return (52.9829189 * inner % 1).astype(np.float32)
+

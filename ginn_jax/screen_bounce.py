@@ -24,8 +24,6 @@ from ginn_jax.screen import (
 )
 from ginn_jax.screen_sectors import Sweep, look_round
 
-# The paper takes 2,025 = 45^2 samples of a window of 54^2 pixels.
-SPACING = 54 / 45
 LEAST_COSINE = 0.05
 
 
@@ -37,6 +35,8 @@ def indirect_irradiance(
     camera: Camera,
     *,
     window: int = 54,
+    samples: int = 45,
+    back: float = 1.0,
     marches: int = 6,
     thickness: float = 0.05,
 ) -> Float[Array, "H W 3"]:
@@ -59,12 +59,13 @@ def indirect_irradiance(
     senders = jnp.where(screen.mask[..., None], senders, 0.0)
     around = ((margin, margin), (margin, margin), (0, 0))
     padded = jnp.pad(senders, around)
-    offsets = jnp.array(window_offsets(window))
+    share = (window / samples) ** 2
+    offsets = jnp.array(window_offsets(window, samples))
 
     def gather(number: Array, total: Array) -> Array:
         offset = offsets[number]
         there = _shifted(padded, offset, margin, screen.mask.shape)
-        factor = form_factor(screen, there[..., 3:])
+        factor = form_factor(screen, there[..., 3:], share, back)
         clear = _unblocked(screen, padded[..., 8], offset, there[..., 8], marches, thickness)
         return total + jnp.where(clear, factor, 0.0)[..., None] * there[..., :3]
 
@@ -84,6 +85,8 @@ def bitmask_irradiance(
     directions: int = 16,
     steps: int = 32,
     thickness: float = 0.05,
+    back: float = 1.0,
+    crowding: float = 2.0,
 ) -> Float[Array, "H W 3"]:
     """Irradiance from up to a `radius` round each pixel (Therrien et al. 2023).
 
@@ -97,15 +100,14 @@ def bitmask_irradiance(
         raise InputError(f"directions {directions} must be even: a slice has two")
     screen = enter_screen(position, normal, mask, camera)
     check_images(screen.mask.shape, exitance=exitance)
-    sweep = Sweep(radius, thickness, directions // 2, steps, crowding=2.0)
+    sweep = Sweep(radius, thickness, directions // 2, steps, crowding, back, joined=True)
     _, arrived = look_round(screen, sweep, jnp.asarray(exitance, jnp.float32))
     return jnp.where(screen.mask[..., None], arrived, 0.0)
 
 
-def window_offsets(window: int) -> Int[np.ndarray, "S 2"]:
-    """Rows and columns of the samples of a window, evenly `SPACING` pixels apart."""
-    count = max(round(window / SPACING), 1)
-    place = (np.arange(count) - (count - 1) / 2) * (window / count)
+def window_offsets(window: int, samples: int) -> Int[np.ndarray, "S 2"]:
+    """Rows and columns of `samples`^2 places evenly all over a window."""
+    place = (np.arange(samples) - (samples - 1) / 2) * (window / samples)
     place = np.round(place).astype(np.int32)
     return np.stack(np.meshgrid(place, place, indexing="ij"), axis=-1).reshape(-1, 2)
 
@@ -119,7 +121,7 @@ def patch_areas(screen: Screen) -> Float[Array, "H W"]:
 
 
 def form_factor(
-    screen: Screen, sender: Float[Array, "H W 7"], share: float = SPACING**2
+    screen: Screen, sender: Float[Array, "H W 7"], share: float, back: float
 ) -> Float[Array, "H W"]:
     """Irradiance at each pixel by a unit exitance of another (normal, place, area).
 
@@ -128,7 +130,8 @@ def form_factor(
     area = share * sender[..., 6]
     way = sender[..., 3:6] - screen.position
     square = jnp.maximum(dot(way, way), 1e-12)
-    leaving = jnp.maximum(-dot(way, sender[..., :3]), 0.0)
+    leaving = -dot(way, sender[..., :3])
+    leaving = jnp.maximum(leaving, -back * leaving)
     arriving = jnp.maximum(dot(way, screen.normal), 0.0)
     return leaving * arriving / square * area / (np.pi * square + area)
 

@@ -95,7 +95,7 @@ def bitmask_occlusion(
     if directions % 2:
         raise InputError(f"directions {directions} must be even: a slice has two")
     screen = enter_screen(position, normal, mask, camera)
-    sweep = Sweep(radius, thickness, directions // 2, steps, 1.0)
+    sweep = Sweep(radius, thickness, directions // 2, steps, 1.0, 0.0, joined=False)
     return jnp.where(screen.mask, look_round(screen, sweep)[0], 1.0)
 
 
@@ -143,7 +143,7 @@ def _hidden(
     depth = jnp.maximum(z, 1e-6)
     column = x / depth * screen.focal + (width - 1) / 2
     row = y / depth * screen.focal + (height - 1) / 2
-    nearness, _ = look_up(table, column, row)
+    nearness, _, _ = look_up(table, column, row)
     seen = 1 / jnp.maximum(nearness, 1e-9)
     return (z > 1e-6) & (seen < z) & (z < seen + thickness)
 

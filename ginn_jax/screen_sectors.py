@@ -10,6 +10,7 @@ Occlusion" (2016). Other than there, a slab is cut to the sphere of the radius b
 its angles are taken, and sectors are even in weight, not in angle.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -39,6 +40,8 @@ class Sweep(NamedTuple):
     slices      directions of the image, each marched to both sides
     steps       pixels marched over to each side
     crowding    exponent of the steps' distances: above 1, nearer ones are denser
+    back        share of its exitance that a sender shows from behind
+    joined      whether what is seen goes on in its plane from step to step
     """
 
     radius: float
@@ -46,6 +49,8 @@ class Sweep(NamedTuple):
     slices: int
     steps: int
     crowding: float
+    back: float
+    joined: bool
 
 
 class Slice(NamedTuple):
@@ -147,15 +152,20 @@ def _march(
     def step(number: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         covered, arrived = state
         side = (1 - 2 * (number % 2)).astype(jnp.float32)
-        share = ((number // 2).astype(jnp.float32) + jitter) / sweep.steps
-        away = side * (reach * share**sweep.crowding + 1)
-        column = columns + away * part.direction[..., 0]
-        row = rows + away * part.direction[..., 1]
-        nearness, place = look_up(depths, column, row)
-        taken = _cover(part, sweep, away / screen.focal, nearness, side)
+        shares = [(number // 2).astype(jnp.float32) + x for x in (jitter, 0.0, 1.0)]
+        away = [
+            side * (0.5 + reach * (share / sweep.steps) ** sweep.crowding)
+            for share in shares
+        ]
+        column = columns + away[0] * part.direction[..., 0]
+        row = rows + away[0] * part.direction[..., 1]
+        nearness, slope, place = look_up(depths, column, row)
+        change = dot(slope, part.direction)
+        patch = [(a / screen.focal, nearness + (a - away[0]) * change) for a in away]
+        taken = _cover(part, sweep, patch, side)
         if colors is not None:
-            ray = screen.rays + (away / screen.focal)[..., None] * part.direction
-            seen = _facing(screen, ray, nearness, colors[place])
+            ray = screen.rays + patch[0][0][..., None] * part.direction
+            seen = _seen(screen, ray, nearness, colors[place], sweep.back)
             fresh = lax.population_count(taken & ~covered).astype(jnp.float32)
             arrived += fresh[..., None] * seen
         return covered | taken, arrived
@@ -179,44 +189,71 @@ def _reach(screen: Screen, radius: float) -> Float[Array, "H W"]:
 def _cover(
     part: Slice,
     sweep: Sweep,
-    away: Float[Array, "H W"],
-    nearness: Float[Array, "H W"],
+    patch: list[tuple[Float[Array, "H W"], Float[Array, "H W"]]],
     side: Float[Array, ""],
 ) -> UInt[Array, "H W"]:
-    """Sectors that the slab at `away` (at depth 1) covers within the radius.
+    """Sectors that a patch covers: what is looked up, where its step starts and ends.
 
-    A point at depth t of the view ray (up, out) lies at (distance + t up, t out) from
-    the pixel; where that is within the radius is an interval of t.
+    Each is given by how far out it is on the screen (at depth 1) and its 1 / z. The
+    first is a slab, of which counts what is within the radius. Joined to its step's
+    ends it lets no light through between two far steps; where steps are a pixel apart
+    it would only make outlines thicker.
     """
-    up = away * part.along[0] - part.length
-    out = away * part.along[1]
-    square = up**2 + out**2
+    (out, nearness), *ends = patch if sweep.joined else patch[:1]
+    first, last = _within(part, sweep, out, nearness)
+    depths = [1 / jnp.maximum(w, 1e-6) for _, w in ends]
+    sectors = [_sector(part, out, z, side) for z in (first, last)]
+    sectors += [
+        _sector(part, a, z, side) for (a, _), z in zip(ends, depths, strict=True)
+    ]
+    low = functools.reduce(jnp.minimum, sectors)
+    high = functools.reduce(jnp.maximum, sectors)
+    met = (nearness > 0) & (first < last)
+    return jnp.where(met, _bits_below(high) & ~_bits_below(low), jnp.uint32(0))
+
+
+def _within(
+    part: Slice,
+    sweep: Sweep,
+    out: Float[Array, "H W"],
+    nearness: Float[Array, "H W"],
+) -> tuple[Float[Array, "H W"], Float[Array, "H W"]]:
+    """From which to which depth a slab is within the radius; the other way round: no.
+
+    A point at depth t lies at (distance + t up, t aside) from the pixel, in the
+    slice's plane; where that is within the radius is an interval of t.
+    """
+    up, aside = _view_ray(part, out)
+    square = up**2 + aside**2
     middle = -part.distance * up / square
     inside = middle**2 - (part.distance**2 - sweep.radius**2) / square
     half = jnp.sqrt(jnp.maximum(inside, 0.0))
     depth = 1 / jnp.maximum(nearness, 1e-9)
     first = jnp.maximum(depth, middle - half)
-    last = jnp.minimum(depth + sweep.thickness, middle + half)
-    ends = [
-        _sector(part, part.distance + t * up, t * out, side) for t in (first, last)
-    ]
-    low, high = jnp.minimum(*ends), jnp.maximum(*ends)
-    met = (nearness > 0) & (inside > 0) & (first < last)
-    return jnp.where(met, _bits_below(high) & ~_bits_below(low), jnp.uint32(0))
+    return first, jnp.minimum(depth + sweep.thickness, middle + half)
+
+
+def _view_ray(
+    part: Slice, out: Float[Array, "H W"]
+) -> tuple[Float[Array, "H W"], Float[Array, "H W"]]:
+    """The ray from the eye that is `out` from the pixel's, by the slice's axes."""
+    return out * part.along[0] - part.length, out * part.along[1]
 
 
 def _sector(
     part: Slice,
-    up: Float[Array, "H W"],
     out: Float[Array, "H W"],
+    depth: Float[Array, "H W"],
     side: Float[Array, ""],
 ) -> UInt[Array, "H W"]:
-    """How many sectors lie before a direction of the slice's plane, rounded.
+    """How many sectors lie before a point of the slice's plane, rounded.
 
     The weight before an angle t is a closed form (Jimenez et al. 2016, equation 7).
     """
-    scale = lax.rsqrt(jnp.maximum(up**2 + out**2, 1e-20))
-    c, s = up * scale, out * scale
+    up, aside = _view_ray(part, out)
+    up, aside = part.distance + depth * up, depth * aside
+    scale = lax.rsqrt(jnp.maximum(up**2 + aside**2, 1e-20))
+    c, s = up * scale, aside * scale
     cos, sin = part.facing
     double = (c * c - s * s) * cos + 2 * s * c * sin
     beyond = side * (cos - double + 2 * side * _angle(c) * sin) / 4
@@ -241,13 +278,14 @@ def _bits_below(count: UInt[Array, "H W"]) -> UInt[Array, "H W"]:
     return jnp.where(count >= SECTORS, all_bits, shifted)
 
 
-def _facing(
+def _seen(
     screen: Screen,
     ray: Float[Array, "H W 3"],
     nearness: Float[Array, "H W"],
     sender: Float[Array, "H W 6"],
+    back: float,
 ) -> Float[Array, "H W 3"]:
-    """Exitance of the senders that turn their front to the pixel."""
+    """Exitance of the senders that turn their front to the pixel, and a share else."""
     there = ray / jnp.maximum(nearness, 1e-9)[..., None]
     toward = dot(sender[..., 3:], screen.position - there)
-    return jnp.where(toward[..., None] > 0, sender[..., :3], 0.0)
+    return sender[..., :3] * jnp.where(toward > 0, 1.0, back)[..., None]
