@@ -47,23 +47,23 @@ def channel_of(cloud: Cloud, channel: int) -> ShadedPoints:
     """
     if isinstance(cloud, ShadedPoints):
         return cloud
-    material, light = network_numbers(cloud)
+    material, light = network_numbers(cloud, slice(channel, channel + 1))
     return ShadedPoints(
         cloud.position,
         cloud.normal,
         cloud.target[:, channel],
         cloud.variance[:, channel],
-        material[channel],
-        light[channel],
+        material[0],
+        light[0],
     )
 
 
 def network_numbers(
-    cloud: LitCloud,
-) -> tuple[Float[np.ndarray, "3 N A"], Float[np.ndarray, "3 N L"]]:
-    """Material and light of every point, for each channel."""
-    albedo = cloud.albedo[cloud.material].T[..., None].astype(np.float32)
-    irradiance = cloud.irradiance.T[..., None]
+    cloud: LitCloud, channels: slice = slice(3)
+) -> tuple[Float[np.ndarray, "C N A"], Float[np.ndarray, "C N L"]]:
+    """Material and light of every point, for each of these channels."""
+    albedo = cloud.albedo[cloud.material, channels].T[..., None].astype(np.float32)
+    irradiance = cloud.irradiance[:, channels].T[..., None]
     if cloud.medium.size == 0:
         return albedo, albedo * irradiance
     extinction, ior = cloud.medium

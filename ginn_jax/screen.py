@@ -160,4 +160,3 @@ def gradient_noise(shape: tuple[int, int]) -> Float[np.ndarray, "H W"]:
     columns, rows = np.indices(shape)[::-1].astype(np.float64)
     inner = (0.06711056 * columns + 0.00583715 * rows) % 1
     return (52.9829189 * inner % 1).astype(np.float32)
-
