@@ -16,9 +16,16 @@ import numpy as np
 from rich.console import Console
 
 from ginn_jax import architecture, evaluate, fit, objects, report, scenes
-from ginn_jax.commandline import require, start
-from ginn_jax.errors import InputError
-from ginn_jax.experiment import Clock, closing, make, train, training
+from ginn_jax.commandline import require_positive, start
+from ginn_jax.experiment import (
+    Clock,
+    RunOptions,
+    check_run,
+    closing,
+    make,
+    train,
+    training,
+)
 from ginn_jax.geometry import Limits
 from ginn_jax.image import limits_at, with_disk_radius
 from ginn_jax.mesh import find_meshes
@@ -31,45 +38,21 @@ RAY_COUNTS = (1, 4, 16, 64, 256)
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(RunOptions):
     """Train ambient occlusion on point clouds and evaluate it on unseen objects."""
 
     out: Path = Path("runs/ao_train")
     """Folder for data, checkpoints, metrics.json, report.md and figures."""
     shapes: int = 240
     """Procedural shapes to train on."""
-    meshes: Path | None = None
-    """A mesh file or a folder of meshes to train on as well."""
-    test_shapes: int = 12
-    """Procedural shapes to evaluate on; training never sees them."""
-    test_meshes: Path | None = None
-    """A mesh file or a folder of unseen meshes to evaluate on as well."""
     rays: int = 64
     """Rays per training point."""
     radius: float = 0.1
     """Occlusion radius, in units of the object's longest side."""
-    points: int = 20_000
-    """Samples per object."""
     preset: Literal["default", "paper", "released", "only_2d", "only_3d"] = "default"
     """Layer table: ours, the paper's, the authors' release, or an ablation of ours."""
-    schedule: Literal["cosine", "paper"] = "cosine"
-    """Learning rate: warm-up and cosine decay, or the paper's x0.7 every 10 epochs."""
-    steps: int = 3000
-    """Training steps."""
-    batch: int = 2
-    """Clouds per step (the paper: 8)."""
-    learning_rate: float = 0.005
-    """Adam's learning rate at its highest."""
     resolution: int = 512
     """Side of the evaluation images in pixels."""
-    resolution_scale: float = 0.5
-    """Shade the evaluation images at this share of their resolution too; 1: do not."""
-    seed: int = 0
-    """Seed of everything."""
-    resume: bool = False
-    """Go on where a killed run with the same options was."""
-    quick: bool = False
-    """A run of about a minute on little data: to try things, not for numbers."""
 
 
 QUICK = {
@@ -84,7 +67,8 @@ QUICK = {
 
 def main(options: Options) -> dict[str, Any]:
     """Run the experiment; returns what metrics.json holds."""
-    check(options)
+    check_run(options, {"rays": 2})
+    require_positive(options, "radius")
     console = Console()
     clock = Clock()
     settings = scenes.Occlusion(options.points, options.rays, options.radius)
@@ -115,21 +99,6 @@ def main(options: Options) -> dict[str, Any]:
         f"{metrics['seconds_total'] / 60:.1f} minutes: {options.out / 'report.md'}"
     )
     return metrics
-
-
-def check(options: Options) -> None:
-    """Raise `InputError` for options that cannot be meant."""
-    least = {"shapes": 0, "test_shapes": 1, "rays": 2, "points": 1000, "steps": 1}
-    least |= {"batch": 1, "resolution": 32, "seed": 0}
-    require(options, least)
-    if not 0 < options.resolution_scale <= 1:
-        raise InputError(
-            f"--resolution-scale is {options.resolution_scale}: give it in (0, 1]"
-        )
-    for name in ("radius", "learning_rate"):
-        value = getattr(options, name)
-        if not (np.isfinite(value) and value > 0):
-            raise InputError(f"--{name.replace('_', '-')} is {value}: give it above 0")
 
 
 def training_sources(options: Options) -> list[objects.Source]:

@@ -60,6 +60,13 @@ def hasten(options: Any, quick: Mapping[str, Any]) -> Any:
     return replace(options, **left)
 
 
+def require_positive(options: Any, name: str) -> None:
+    """Raise `InputError` for an option that is not a finite number above 0."""
+    value = getattr(options, name)
+    if not 0 < value < float("inf"):
+        raise InputError(f"--{name.replace('_', '-')} is {value}: give it above 0")
+
+
 def require(options: Any, least: Mapping[str, int]) -> None:
     """Raise `InputError` for the first option below its least value."""
     for name, minimum in least.items():

@@ -4,7 +4,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rich.console import Console
 from rich.progress import (
@@ -17,10 +17,59 @@ from rich.progress import (
 
 from ginn_jax import fit, report, scenes
 from ginn_jax.architecture import Network
+from ginn_jax.commandline import require, require_positive
+from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import Cloud
 from ginn_jax.objects import Source
 from ginn_jax.process import available_cores
 from ginn_jax.train import Training
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What every training experiment can be told, whatever its effect."""
+
+    out: Path = Path("runs/train")
+    """Folder for data, checkpoints, metrics.json, report.md and figures."""
+    shapes: int = 300
+    """Procedural shapes to train on."""
+    meshes: Path | None = None
+    """A mesh file or a folder of meshes to train on as well."""
+    test_shapes: int = 12
+    """Procedural shapes to evaluate on; training never sees them."""
+    test_meshes: Path | None = None
+    """A mesh file or a folder of unseen meshes to evaluate on as well."""
+    points: int = 20_000
+    """Samples per object."""
+    schedule: Literal["cosine", "paper"] = "cosine"
+    """Learning rate: warm-up and cosine decay, or the paper's x0.7 every 10 epochs."""
+    steps: int = 3000
+    """Training steps."""
+    batch: int = 2
+    """Clouds per step (the paper: 8)."""
+    learning_rate: float = 0.005
+    """Adam's learning rate at its highest."""
+    resolution: int = 256
+    """Side of the evaluation images in pixels."""
+    resolution_scale: float = 0.5
+    """Shade the evaluation images at this share of their resolution too; 1: do not."""
+    seed: int = 0
+    """Seed of everything."""
+    resume: bool = False
+    """Go on where a killed run with the same options was."""
+    quick: bool = False
+    """A run of about a minute on little data: to try things, not for numbers."""
+
+
+def check_run(options: RunOptions, least: dict[str, int]) -> None:
+    """Raise `InputError` for options that cannot be meant; `least` has more bounds."""
+    bounds = {"shapes": 0, "test_shapes": 1, "points": 1000, "steps": 1, "batch": 1}
+    require(options, bounds | {"resolution": 32, "seed": 0} | least)
+    if not 0 < options.resolution_scale <= 1:
+        raise InputError(
+            f"--resolution-scale is {options.resolution_scale}: give it in (0, 1]"
+        )
+    require_positive(options, "learning_rate")
 
 
 @dataclass
@@ -85,7 +134,9 @@ def train(
         return fit.fit(config, clouds, out, fit.Schedule(), tell, resume, extra)
 
 
-def training(options: Any, network: Network, points: int, clouds: int) -> Training:
+def training(
+    options: RunOptions, network: Network, points: int, clouds: int
+) -> Training:
     """The training configuration that the options ask for."""
     return Training(
         network,
@@ -101,7 +152,7 @@ def training(options: Any, network: Network, points: int, clouds: int) -> Traini
 
 
 def closing(
-    options: Any, run: fit.Fit, config: Training, clock: Clock
+    options: RunOptions, run: fit.Fit, config: Training, clock: Clock
 ) -> dict[str, Any]:
     """What metrics.json says of every run, whatever its effect."""
     seconds = {f"seconds_{name}": spent for name, spent in clock.parts.items()}

@@ -12,10 +12,16 @@ from rich.console import Console
 
 from ginn_jax import evaluate_light, fit, report
 from ginn_jax.architecture import Network
-from ginn_jax.commandline import require
-from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model, mean_rows
-from ginn_jax.experiment import Clock, closing, make, train, training
+from ginn_jax.experiment import (
+    Clock,
+    RunOptions,
+    check_run,
+    closing,
+    make,
+    train,
+    training,
+)
 from ginn_jax.lighting import find_environments
 from ginn_jax.lit_clouds import LitCloud, network_numbers
 from ginn_jax.lit_report import write_report
@@ -42,49 +48,19 @@ Preset = Literal["homogeneous", "linear", "released", "only_2d", "only_3d"]
 
 
 @dataclass(frozen=True)
-class LitOptions:
+class LitOptions(RunOptions):
     """What every effect that carries light can be told."""
 
-    out: Path = Path("runs/lit")
-    """Folder for data, checkpoints, metrics.json, report.md and figures."""
-    shapes: int = 300
-    """Procedural shapes to train on."""
-    meshes: Path | None = None
-    """A mesh file or a folder of meshes to train on as well."""
     envmaps: Path | None = None
     """An environment map or a folder of them to train on as well."""
     lights: int = 1
     """Lights for every object."""
-    test_shapes: int = 12
-    """Procedural shapes to evaluate on; training never sees them."""
-    test_meshes: Path | None = None
-    """A mesh file or a folder of unseen meshes to evaluate on as well."""
     test_envmaps: Path | None = None
     """Unseen environment maps to evaluate under, instead of procedural ones."""
     split: Literal["default", "paper"] = "default"
     """The paper's: 1,000 x 20, 200 x 5 and 500 x 5 objects and lights, 4,096 paths."""
     paths: int = 32
     """Paths per training point."""
-    points: int = 20_000
-    """Samples per object."""
-    schedule: Literal["cosine", "paper"] = "cosine"
-    """Learning rate: warm-up and cosine decay, or the paper's x0.7 every 10 epochs."""
-    steps: int = 3000
-    """Training steps."""
-    batch: int = 2
-    """Clouds per step (the paper: 8)."""
-    learning_rate: float = 0.005
-    """Adam's learning rate at its highest."""
-    resolution: int = 256
-    """Side of the evaluation images in pixels."""
-    resolution_scale: float = 0.5
-    """Shade the evaluation images at this share of their resolution too; 1: do not."""
-    seed: int = 0
-    """Seed of everything."""
-    resume: bool = False
-    """Go on where a killed run with the same options was."""
-    quick: bool = False
-    """A run of about a minute on little data: to try things, not for numbers."""
 
 
 QUICK = {
@@ -97,19 +73,6 @@ QUICK = {
 }
 
 
-def check(options: LitOptions) -> None:
-    """Raise `InputError` for options that cannot be meant."""
-    least = {"shapes": 0, "test_shapes": 1, "paths": 2, "points": 1000, "steps": 1}
-    least |= {"batch": 1, "resolution": 32, "seed": 0, "lights": 1}
-    require(options, least)
-    if not 0 < options.resolution_scale <= 1:
-        raise InputError(
-            f"--resolution-scale is {options.resolution_scale}: give it in (0, 1]"
-        )
-    if not (np.isfinite(options.learning_rate) and options.learning_rate > 0):
-        raise InputError(f"--learning-rate is {options.learning_rate}: give it above 0")
-
-
 def run_experiment(
     options: LitOptions,
     settings: Illumination | Scattering,
@@ -117,7 +80,7 @@ def run_experiment(
     title: str,
 ) -> dict[str, Any]:
     """Data, training, evaluation and report of one effect; what metrics.json holds."""
-    check(options)
+    check_run(options, {"paths": 2, "lights": 1})
     console, clock, begin = Console(), Clock(), time.perf_counter()
     seen, unseen = choose_sources(options)
     if options.split == "paper":

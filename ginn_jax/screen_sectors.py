@@ -13,7 +13,6 @@ its angles are taken, and sectors are even in weight, not in angle.
 import functools
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
