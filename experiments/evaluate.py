@@ -279,7 +279,8 @@ def summary(
     """What metrics.json holds."""
     results = compare_report.pool_shots(rows)
     for row in results:
-        row |= {k: at_points.get(row["method"], {}).get(k, "-") for k in KEPT}
+        known = at_points.get(row["method"], {})
+        row |= {k: known[k] for k in KEPT if k in known}
     front = compare_report.pool_shots(front_rows)
     ours = next(r for r in results if r["method"] == compare_report.OURS)
     units = "" if options.effect == "ao" else UNITS

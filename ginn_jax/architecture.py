@@ -49,6 +49,8 @@ class Network:
     lights      numbers of the light that a point comes with
     linear      whether light has features of its own on which nothing but linear maps
                 act, so that the output is exactly linear in light
+    local       whether the light at a query and near it also reaches the output on a
+                linear path, scaled by features: normalised features forget magnitude
     asks        what f_2D sees of a query: its "normal", or "all" its attributes
     splat       whether points are shaded, and their shading only blended at queries
     """
@@ -66,6 +68,7 @@ class Network:
     materials: int = 0
     lights: int = 0
     linear: bool = False
+    local: bool = False
     asks: Literal["normal", "all"] = "normal"
     splat: bool = False
 
@@ -195,10 +198,10 @@ PRESETS |= with_ablations(DEFAULT)
 # Light: the albedo of a point and what it sends out; or albedo, extinction and index
 # of refraction, and the irradiance.
 # Light goes further than occlusion, hence a level more.
-_WIDE = compact_network(k=16, levels=(0.02, 0.05, 0.1, 0.2), lights=1)
+_WIDE = compact_network(k=16, levels=(0.02, 0.05, 0.1, 0.2), lights=1, local=True)
 LIT = {
     "homogeneous": _WIDE,
-    "linear": replace(_WIDE, linear=True),
+    "linear": replace(_WIDE, linear=True, local=False),
     "released": replace(RELEASED, lights=1),
 } | with_ablations(_WIDE)
 ILLUMINATION = {name: replace(n, materials=1) for name, n in LIT.items()}

@@ -43,7 +43,8 @@ class Norm(nn.Module):
 class Code(NamedTuple):
     """What a point carries: `free` features, and `light` ones, linear in the light.
 
-    Networks that are not linear have no `light`: it came in among the attributes.
+    Networks that are not linear have no `light` inside f_3D: it came in among the
+    attributes. `local` ones hand the point's own on to f_2D.
     """
 
     free: Float[Any, "N K"]
@@ -152,7 +153,9 @@ class Encoder(nn.Module):
             free = Norm(config.norm, self.train)(free, levels[0].mask)
         free = nn.Dense(config.latent, name="latent")(free)
         free = Norm(config.norm, self.train)(free, levels[0].mask)
-        return Code(free, None if x.light is None else self._dim(free, x.light))
+        if x.light is not None:
+            return Code(free, self._dim(free, x.light))
+        return Code(free, light if config.local and not config.splat else None)
 
     def _dim(self, free: Array, light: Array) -> Array:
         return Gate(self.config.latent, name="latent_light")(free, light)
@@ -195,12 +198,13 @@ class Shader(nn.Module):
             return splat(nn.Dense(1)(free)[:, 0], field, mask.shape[0])
         layer = McConv(config, config.query, self.train, name=config.query.name)
         x = layer(code, senders, field, attributes.shape[0])
-        attributes, light = enter(config, attributes, light)
+        seen, _ = enter(config, attributes, light)
         free = Norm(config.norm, self.train)(x.free, mask)
-        free = nn.Dense(config.head)(jnp.concatenate([free, attributes], axis=1))
+        free = nn.Dense(config.head)(jnp.concatenate([free, seen], axis=1))
         free = Norm(config.norm, self.train)(free, mask)
+        values = 0.0 if config.linear else nn.Dense(1)(free)[:, 0]
         if x.light is None:
-            return nn.Dense(1)(free)[:, 0]
+            return values
         beams = [x.light] if light is None else [x.light, light]
         dimmed = Gate(config.head, name="out_light")(free, jnp.concatenate(beams, 1))
-        return jnp.sum(dimmed, axis=1)
+        return values + jnp.sum(dimmed, axis=1)

@@ -85,9 +85,10 @@ def plan_queries(
     queries, order = in_coherent_order(queries)
     ends = geometry.levels[0], geometry.grid, geometry.area
     field, demands = build_query_field(network, limits, *ends, queries)
-    name = network.query.name
-    kernel = variables["shader"]["params"][name]["kernel"]
-    stored = {name: {"kernel": stored_kernel(kernel, field)}}
+    name, weights = network.query.name, variables["shader"]["params"]
+    stored = {}
+    if not network.splat:
+        stored[name] = {"kernel": stored_kernel(weights[name]["kernel"], field)}
     return QueryPlan(field, stored, queries, order), demands
 
 

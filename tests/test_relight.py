@@ -8,15 +8,27 @@ import pytest
 import tiny
 
 from ginn_jax import image, train
+from ginn_jax.architecture import only_2d, only_3d
+from ginn_jax.geometry import limit_names, uniform_limits
 from ginn_jax.lit_clouds import LitCloud, network_numbers
 from ginn_jax.relight import prepare_relighting, relight
 
 KEY = jax.random.key(1)
+LOCAL = replace(tiny.NETWORK, materials=3, lights=1, asks="all", local=True)
 EFFECTS = {
     "illumination": replace(tiny.NETWORK, linear=True, materials=1, lights=1),
     "scattering": replace(tiny.NETWORK, linear=True, materials=3, lights=1, asks="all"),
     "homogeneous": replace(tiny.NETWORK, materials=1, lights=1),
+    "local": LOCAL,
+    "only_2d": only_2d(LOCAL),
+    "only_3d": only_3d(LOCAL),
 }
+
+
+def limits_of(network):
+    """The tiny network's, or large ones where the table is another."""
+    known = set(limit_names(network)) == set(limit_names(tiny.NETWORK))
+    return tiny.LIMITS if known else uniform_limits(network, 1 << 15)
 
 
 def lit(count, seed, medium=()):
@@ -43,7 +55,7 @@ def case(request):
 
 def shade(network, variables, cloud, queries):
     ends = variables, cloud.position, cloud.normal, *network_numbers(cloud)
-    encoded, limits = image.encode_cloud(network, tiny.LIMITS, *ends, key=KEY)
+    encoded, limits = image.encode_cloud(network, limits_of(network), *ends, key=KEY)
     ends = variables, encoded, queries.position, queries.normal
     numbers = network_numbers(queries)
     return image.shade_points(network, limits, *ends, *numbers)[0]
@@ -104,7 +116,7 @@ def test_lights_add_up_where_the_network_is_linear(case):
 
 def test_relighting_is_shading(case):
     network, variables, cloud, queries = case
-    given = network, tiny.LIMITS, variables, cloud, queries
+    given = network, limits_of(network), variables, cloud, queries
     ready, _ = prepare_relighting(*given, key=KEY)
     rng = np.random.default_rng(7)
     for factor in (1.0, 20.0):
