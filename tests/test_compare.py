@@ -1,0 +1,121 @@
+"""Comparisons: fronts and lost cells by definition, methods on the same pixels."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tiny
+from hypothesis import given
+from hypothesis import strategies as st
+
+from experiments import evaluate as experiment
+from ginn_jax import checkpoint, compare_report
+from ginn_jax.compare_report import (
+    OURS,
+    RIVALS,
+    inset_place,
+    lost_cells,
+    pareto_front,
+    pool_shots,
+)
+
+numbers = st.floats(1e-3, 1e3)
+rows = st.lists(st.tuples(numbers, numbers), min_size=1, max_size=12).map(
+    lambda pairs: [
+        {"method": str(i), "seconds": s, "mse_2d": e} for i, (s, e) in enumerate(pairs)
+    ]
+)
+
+
+@given(rows)
+def test_front_is_what_nothing_beats(rows):
+    front = set(pareto_front(rows))
+    for row in rows:
+        beaten = any(
+            r["seconds"] <= row["seconds"]
+            and r["mse_2d"] <= row["mse_2d"]
+            and (r["seconds"], r["mse_2d"]) != (row["seconds"], row["mse_2d"])
+            for r in rows
+        )
+        twins = [
+            r["method"]
+            for r in rows
+            if (r["seconds"], r["mse_2d"]) == (row["seconds"], row["mse_2d"])
+        ]
+        assert bool(front & set(twins)) == (not beaten)
+
+
+def test_lost_cells_are_those_a_rival_wins():
+    ours = {"method": OURS, "mse_3d": 0.1, "mse_2d": 0.1, "dssim_2d": 0.1}
+    others = [{"method": r, "mse_2d": 0.2, "dssim_2d": 0.2} for r in RIVALS]
+    assert lost_cells([ours, *others]) == []
+    others[1] |= {"mse_3d": 0.05}
+    others[0] |= {"dssim_2d": 0.09}
+    lost = lost_cells([ours, *others])
+    assert len(lost) == 2
+    assert lost[0].startswith("mse_3d: 2D only 0.05")
+    assert lost[1].startswith("dssim_2d: screen space 0.09")
+    fast = {"method": "visibility bitmask", "mse_2d": 0.0, "dssim_2d": 0.0}
+    assert len(lost_cells([ours, *others, fast])) == 2
+
+
+def test_pooled_relative_error_is_a_ratio_of_means():
+    shots = [
+        {"method": "a", "mse_2d": 1.0, "variance_2d": 1.0, "relative_mse_2d": 1.0},
+        {"method": "a", "mse_2d": 1.0, "variance_2d": 9.0, "relative_mse_2d": 1 / 9},
+    ]
+    [pooled] = pool_shots(shots)
+    assert pooled["relative_mse_2d"] == pytest.approx(0.2)
+    assert pooled["shots"] == 2
+
+
+def test_inset_lies_where_the_reference_varies():
+    image = np.ones((100, 100, 3))
+    image[70:80, 20:30] += np.random.default_rng(0).uniform(0, 1, (10, 10, 1))
+    (row, column), size = inset_place(image)
+    assert row <= 75 <= row + size
+    assert column <= 25 <= column + size
+
+
+def finished_run(folder):
+    """A folder as a training run leaves it, of the tiny untrained network."""
+    folder.mkdir()
+    checkpoint.save_run(folder, tiny.CONFIG, tiny.LIMITS, {})
+    manager = checkpoint.open_manager(folder, fresh=True)
+    checkpoint.save_state(manager, tiny.fresh_state())
+    manager.close()
+    return folder
+
+
+def test_comparison_ends_in_a_report_and_keeps_its_references(tmp_path):
+    run = finished_run(tmp_path / "run")
+    options = experiment.Options(
+        out=tmp_path / "out",
+        checkpoint=run,
+        only_2d=run,
+        only_3d=run,
+        objects=1,
+        views=1,
+        resolution=48,
+        reference=16,
+        counts=(1, 4),
+        disks=(),
+        points=2000,
+    )
+    first = experiment.main(options)
+    names = [row["method"] for row in first["results"]]
+    assert names == ["screen space", "visibility bitmask", OURS, "2D only", "3D only"]
+    traced = {r["method"]: r for r in first["error_against_time"] if "traced" in r}
+    assert traced["4 rays"]["mse_2d"] < traced["1 rays"]["mse_2d"]
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert all(name in text for name in names)
+    assert (tmp_path / "out" / "ablation.png").stat().st_size > 1000
+    kept = next((tmp_path / "out" / "references").iterdir())
+    before = kept.stat().st_mtime_ns
+    again = experiment.main(replace(options, seed=0))
+    assert kept.stat().st_mtime_ns == before
+    for one, two in zip(first["results"], again["results"], strict=True):
+        assert one["mse_2d"] == two["mse_2d"]
+    stored = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert stored["lost_cells"] == compare_report.lost_cells(stored["results"])

@@ -1,0 +1,105 @@
+"""Animations: samples stay on their faces, and flicker is what the reference lacks."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from ginn_jax import sequences
+from ginn_jax.errors import InputError
+
+DATA = sequences.procedural_animation(3, 5)
+
+
+def test_frames_share_a_unit_box_and_a_ground():
+    meshes = sequences.frames_of(DATA, 5, ground=True)
+    places = np.stack([m.vertices[:-4] for m in meshes])
+    extent = places.max(axis=(0, 1)) - places.min(axis=(0, 1))
+    assert extent.max() == pytest.approx(1.0, abs=1e-5)
+    floors = np.stack([m.vertices[-4:] for m in meshes])
+    np.testing.assert_array_equal(floors, floors[:1].repeat(5, axis=0))
+    gap = places[..., 1].min() - floors[0, 0, 1]
+    assert 0 < gap < 1e-3
+    np.testing.assert_allclose(np.diff(places, axis=0).max(), 0.0, atol=0.5)
+    assert np.abs(np.diff(places, axis=0)).max() > 1e-3
+
+
+def test_samples_move_with_their_faces():
+    meshes = sequences.frames_of(DATA, 5, ground=True)
+    carried = sequences.carried_samples(meshes[0], 500, seed=1)
+    for mesh in meshes:
+        samples = sequences.samples_at(mesh, carried)
+        corners = mesh.vertices[mesh.faces[carried.face]].astype(float)
+        off = samples.position - corners[:, 0]
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        np.testing.assert_allclose((off * across).sum(1), 0, atol=1e-5)
+        np.testing.assert_allclose(samples.normal, across, atol=1e-4)
+        np.testing.assert_array_equal(samples.material, mesh.material[carried.face])
+    still = sequences.samples_at(meshes[0], carried)
+    again = sequences.samples_at(meshes[0], carried)
+    np.testing.assert_array_equal(still.position, again.position)
+
+
+frames = hnp.arrays(np.float32, (4, 6), elements=st.floats(0, 1, width=32))
+
+
+@given(frames, frames, st.floats(-1, 1, width=32))
+def test_flicker_forgives_what_stands_still(reference, images, offset):
+    seen, nothing = np.ones((4, 6), bool), np.zeros((4, 6), np.float32)
+    constant = sequences.flicker(reference + offset, reference, nothing, seen)
+    assert constant == pytest.approx(0, abs=1e-10)
+    by_hand = 0.0
+    for t in range(3):
+        for p in range(6):
+            mine = float(images[t + 1, p]) - float(images[t, p])
+            right = float(reference[t + 1, p]) - float(reference[t, p])
+            by_hand += (mine - right) ** 2 / 18
+    found = sequences.flicker(images, reference, nothing, seen)
+    assert found == pytest.approx(by_hand, abs=1e-6)
+
+
+def test_flicker_of_a_noisy_reference_is_that_of_the_truth():
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(size=(12, 20_000))
+    images = truth + 0.1 * rng.normal(size=truth.shape)
+    noisy = truth + 0.2 * rng.normal(size=truth.shape)
+    seen, variance = np.ones(truth.shape, bool), np.full(truth.shape, 0.04)
+    assert sequences.flicker(images, noisy, variance, seen) == pytest.approx(
+        0.02, rel=0.05
+    )
+
+
+def test_flicker_counts_pixels_seen_in_both_frames():
+    images = np.array([[0.0, 0.0], [1.0, 5.0]], np.float32)
+    nothing = np.zeros_like(images)
+    seen = np.array([[True, False], [True, True]])
+    assert sequences.flicker(images, nothing, nothing, seen) == 1.0
+
+
+def test_what_is_no_animation_is_refused(tmp_path):
+    good = {"vertices": DATA.vertices, "faces": DATA.faces}
+    path = tmp_path / "a.npz"
+    np.savez(path, **good)
+    assert sequences.load_animation(path).vertices.shape == DATA.vertices.shape
+    broken = {
+        "nothing of faces": {"vertices": DATA.vertices},
+        "one frame": good | {"vertices": DATA.vertices[:1]},
+        "flat": good | {"vertices": DATA.vertices[..., :2]},
+        "nan": good | {"vertices": np.nan * DATA.vertices},
+        "outside": good | {"faces": DATA.faces + 10**6},
+        "negative": good | {"faces": DATA.faces - 10**6},
+    }
+    for arrays in broken.values():
+        np.savez(path, **arrays)
+        with pytest.raises(InputError, match=r"a\.npz"):
+            sequences.load_animation(path)
+    path.write_bytes(b"PK\x03\x04 not a zip")
+    with pytest.raises(InputError, match="not an"):
+        sequences.load_animation(path)
+    with pytest.raises(InputError, match="no such"):
+        sequences.load_animation(tmp_path / "b.npz")
+    one = np.zeros((2, 3, 3), np.float32)
+    with pytest.raises(InputError, match="coincide"):
+        sequences.frames_of(sequences.Animation(one, np.array([[0, 1, 2]])), 2, False)
