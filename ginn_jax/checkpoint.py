@@ -2,7 +2,8 @@
 
 import json
 import shutil
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,12 +13,15 @@ import orbax.checkpoint as ocp
 from jax.sharding import SingleDeviceSharding
 
 from ginn_jax.architecture import Conv, Network
+from ginn_jax.checks import LARGEST_INDEX, whole
 from ginn_jax.errors import InputError
+from ginn_jax.files import unwritable, writing
 from ginn_jax.geometry import Limits, limit_names
 from ginn_jax.network import Variables
 from ginn_jax.train import Training, TrainState, state_shapes
 
 KEPT = 2
+CHECKPOINTS, RECORD = "checkpoints", "run.json"
 
 
 def open_manager(folder: Path, fresh: bool = False) -> ocp.CheckpointManager:
@@ -25,11 +29,16 @@ def open_manager(folder: Path, fresh: bool = False) -> ocp.CheckpointManager:
 
     `fresh` removes those of an earlier run.
     """
-    path = (folder / "checkpoints").absolute()
-    if fresh and path.exists():
-        shutil.rmtree(path)
-    options = ocp.CheckpointManagerOptions(max_to_keep=KEPT, create=True)
-    return ocp.CheckpointManager(path, options=options)
+    path = (folder / CHECKPOINTS).absolute()
+    options = ocp.CheckpointManagerOptions(
+        max_to_keep=KEPT, create=True, cleanup_tmp_directories=True
+    )
+    try:
+        if fresh and path.exists():
+            shutil.rmtree(path)
+        return ocp.CheckpointManager(path, options=options)
+    except OSError as error:
+        raise InputError(unwritable(path, error)) from None
 
 
 def save_state(manager: ocp.CheckpointManager, state: TrainState) -> None:
@@ -73,9 +82,8 @@ def save_run(
     """Write what a resumed run must agree with: configuration and capacities."""
     record = {"training": asdict(config), "limits": dict(limits.sizes), **extra}
     text = json.dumps(record, indent=1, sort_keys=True)
-    temporary = folder / "run.json.partial"
-    temporary.write_text(text)
-    temporary.replace(folder / "run.json")
+    with writing(folder / RECORD) as partial:
+        partial.write_text(text)
 
 
 def load_run(folder: Path, config: Training, extra: dict[str, Any]) -> Limits:
@@ -84,17 +92,11 @@ def load_run(folder: Path, config: Training, extra: dict[str, Any]) -> Limits:
     Raises:
         InputError: no run there, an unreadable record, or other settings than now.
     """
-    path = folder / "run.json"
-    try:
-        record = json.loads(path.read_text())
+    path = folder / RECORD
+    record = _read_record(path, "no run to resume: leave out --resume")
+    with _damage(path, "delete it and start anew"):
         training = dict(record["training"])
-        limits = Limits(tuple((k, int(v)) for k, v in record["limits"].items()))
-    except FileNotFoundError:
-        raise InputError(
-            f"{folder} holds no run to resume: leave out --resume"
-        ) from None
-    except (ValueError, KeyError, AttributeError, TypeError):
-        raise InputError(f"{path} is damaged: delete it and start anew") from None
+        limits = _limits_from(record)
     wanted = json.loads(json.dumps({"training": asdict(config), **extra}))
     for name in sorted(wanted["training"]):
         if training.get(name) != wanted["training"][name]:
@@ -122,16 +124,14 @@ def load_weights(folder: Path) -> tuple[Training, Limits, Variables]:
     Raises:
         InputError: no run there, no checkpoint yet, or a damaged file.
     """
-    path = folder / "run.json"
-    try:
-        record = json.loads(path.read_text())
+    path = folder / RECORD
+    record = _read_record(path, "no run: name the --out of one")
+    with _damage(path, "train again"):
         config = _training_from(record["training"])
-        limits = Limits(tuple((k, int(v)) for k, v in record["limits"].items()))
-    except FileNotFoundError:
-        raise InputError(f"{folder} holds no run: name the --out of one") from None
-    except (ValueError, KeyError, AttributeError, TypeError):
-        raise InputError(f"{path} is damaged: train again") from None
+        limits = _limits_from(record)
     _check_names(path, config.network, limits)
+    if not (folder / CHECKPOINTS).is_dir():
+        raise InputError(f"{folder} holds no checkpoint yet: let its run go on")
     here = SingleDeviceSharding(jax.devices()[0])
     like = jax.tree.map(
         lambda s: jax.ShapeDtypeStruct(s.shape, s.dtype, sharding=here),
@@ -142,6 +142,38 @@ def load_weights(folder: Path) -> tuple[Training, Limits, Variables]:
     if state is None:
         raise InputError(f"{folder} holds no checkpoint yet: let its run go on")
     return config, limits, state.variables
+
+
+def _read_record(path: Path, missing: str) -> Any:
+    """What `save_run` wrote; None where that is not JSON."""
+    try:
+        with open(path, "rb") as file:
+            if file.read(1) != b"{":
+                return None
+            return json.loads(b"{" + file.read())
+    except FileNotFoundError:
+        raise InputError(f"{path.parent} holds {missing}") from None
+    except OSError as error:
+        raise InputError(
+            f"{path} cannot be read ({error.strerror}): mend that or choose another"
+        ) from None
+    except (ValueError, RecursionError):
+        return None
+
+
+@contextmanager
+def _damage(path: Path, mend: str) -> Iterator[None]:
+    """Say of a record without what should be in it that it is damaged."""
+    try:
+        yield
+    except (ValueError, KeyError, AttributeError, TypeError, OverflowError):
+        raise InputError(f"{path} is damaged: {mend}") from None
+
+
+def _limits_from(record: dict[str, Any]) -> Limits:
+    """The capacities that `save_run` wrote."""
+    sizes = record["limits"].items()
+    return Limits(tuple((name, whole(name, n, 1, LARGEST_INDEX)) for name, n in sizes))
 
 
 def _training_from(record: dict[str, Any]) -> Training:

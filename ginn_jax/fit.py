@@ -18,6 +18,7 @@ from ginn_jax.checkpoint import (
 )
 from ginn_jax.dataset import ShadedPoints, batch_order, stack_clouds
 from ginn_jax.errors import InputError
+from ginn_jax.files import writing
 from ginn_jax.geometry import (
     Limits,
     exceeded,
@@ -139,14 +140,16 @@ def training_limits(config: Training, clouds: Sequence[Cloud]) -> Limits:
 
 def save_losses(folder: Path, history: Sequence[float]) -> None:
     """Keep the loss of every step beside the checkpoints."""
-    np.save(folder / "losses.npy", np.asarray(history, np.float32))
+    with writing(folder / "losses.npy") as partial, open(partial, "wb") as file:
+        np.save(file, np.asarray(history, np.float32))
 
 
 def load_losses(folder: Path, steps: int) -> np.ndarray:
     """The losses of the first `steps` steps; NaN where the file lacks them."""
     try:
-        found = np.load(folder / "losses.npy")[:steps]
-    except (OSError, ValueError):
+        found = np.load(folder / "losses.npy", allow_pickle=False)[:steps]
+        found = found.astype(np.float32).reshape(-1)
+    except Exception:  # NumPy raises what it likes
         found = np.zeros(0, np.float32)
     missing = np.full(steps - len(found), np.nan, np.float32)
     return np.concatenate([found, missing])
