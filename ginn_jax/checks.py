@@ -75,7 +75,7 @@ def unit_rows(points: Any, normals: Any, what: str = "points") -> None:
         )
     if not np.isfinite(points).all():
         raise InputError(f"{what} holds non-finite numbers: drop those rows")
-    if not np.isfinite(normals).all():
-        raise InputError("normals holds non-finite numbers: drop those rows")
     if not np.all(np.abs(np.einsum("ij,ij->i", normals, normals) - 1) < 2e-3):
-        raise InputError("normals are not of unit length: divide them by their length")
+        raise InputError(
+            "normals are non-finite or not of unit length: divide them by their length"
+        )

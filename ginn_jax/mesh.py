@@ -239,7 +239,7 @@ def _checked_arrays(vertices, faces, material):
     """float32 vertices, int64 faces and int32 materials that belong together."""
     vertices, faces = real_array("vertices", vertices), real_array("faces", faces)
     if vertices.size == 0 or faces.size == 0:
-        raise InputError("mesh: empty; give at least one triangle")
+        raise InputError("mesh: empty; give vertices and faces")
     if (
         vertices.shape[1:] != (3,)
         or faces.shape[1:] != (3,)

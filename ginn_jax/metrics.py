@@ -81,7 +81,9 @@ def tone_map(image: Image, reference: Image, mask: Mask | None = None) -> Image:
     clipped, then raised to 1/1.6. Map both images of a pair with the same reference.
     A reference that is black there leaves the scale at 1.
     """
-    image, reference = _pair(image, reference)
+    image, reference = (
+        real_array("image", x).astype(np.float64) for x in (image, reference)
+    )
     colour = reference.ndim == 3 and reference.shape[-1] == 3
     luminance = _kept(reference @ LUMINANCE if colour else reference, mask)
     white = np.percentile(luminance, PERCENTILE)
