@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,16 +37,43 @@ def open_manager(folder: Path, fresh: bool = False) -> ocp.CheckpointManager:
     try:
         if fresh and path.exists():
             shutil.rmtree(path)
-        return ocp.CheckpointManager(path, options=options)
+        handler = ocp.StandardCheckpointHandler()
+        return ocp.CheckpointManager(path, options=options, item_handlers=handler)
     except OSError as error:
         raise InputError(unwritable(path, error)) from None
 
 
 def save_state(manager: ocp.CheckpointManager, state: TrainState) -> None:
-    """Write the state under its step number, unless it is there."""
+    """Start to write the state under its step number, unless it is there.
+
+    Raises:
+        InputError: the one before could not be written.
+    """
     step = int(state.step)
     if step not in manager.all_steps():
-        manager.save(step, args=ocp.args.StandardSave(state._asdict()))
+        with _whole_or_none(manager):
+            manager.save(step, args=ocp.args.StandardSave(state._asdict()))
+
+
+def finish(manager: ocp.CheckpointManager) -> None:
+    """Wait until all is written; `InputError` where it could not be."""
+    with _whole_or_none(manager):
+        manager.close()
+
+
+@contextmanager
+def _whole_or_none(manager: ocp.CheckpointManager) -> Iterator[None]:
+    """Remove what was written of a checkpoint if the rest cannot be."""
+    try:
+        yield
+    except Exception as error:  # TensorStore says it by ValueError
+        folder = Path(str(manager.directory))
+        for half in folder.glob("*.orbax-checkpoint-tmp"):
+            shutil.rmtree(half, ignore_errors=True)
+        why = " ".join(str(error).split())[-80:]
+        raise InputError(
+            f"{folder}: checkpoint cannot be written ({why}): make room, then --resume"
+        ) from None
 
 
 def restore_state(
@@ -61,6 +89,8 @@ def restore_state(
         return None
     shapes = jax.tree.map(_shape_of, like._asdict())
     try:
+        # TensorStore would say it as well, after tracebacks of its own.
+        _check_shapes(manager.item_metadata(step), shapes)
         found = manager.restore(step, args=ocp.args.StandardRestore(shapes))
     except Exception as error:
         folder = Path(str(manager.directory)) / str(step)
@@ -69,6 +99,21 @@ def restore_state(
             f"checkpoint {folder} cannot be read ({reason}): delete it or start anew"
         ) from None
     return TrainState(**found)
+
+
+def _check_shapes(found: Any, wanted: Any) -> None:
+    """Raise `ValueError` unless the checkpoint has arrays of these shapes."""
+    there, here = _shapes_by_name(found), _shapes_by_name(wanted)
+    for name, shape in sorted((there | here).items()):
+        if there.get(name) != here.get(name):
+            raise ValueError(f"not of this network: {name} {shape}")
+
+
+def _shapes_by_name(tree: Any) -> dict[str, tuple[int, ...]]:
+    """Orbax turns tuples with names into dicts: what is left is names and shapes."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    name = partial(jax.tree_util.keystr, simple=True, separator=".")
+    return {name(path): tuple(leaf.shape) for path, leaf in leaves}
 
 
 def _shape_of(leaf: Any) -> jax.ShapeDtypeStruct:
@@ -82,8 +127,8 @@ def save_run(
     """Write what a resumed run must agree with: configuration and capacities."""
     record = {"training": asdict(config), "limits": dict(limits.sizes), **extra}
     text = json.dumps(record, indent=1, sort_keys=True)
-    with writing(folder / RECORD) as partial:
-        partial.write_text(text)
+    with writing(folder / RECORD) as new:
+        new.write_text(text)
 
 
 def load_run(folder: Path, config: Training, extra: dict[str, Any]) -> Limits:

@@ -2,9 +2,11 @@
 
 import contextlib
 import io
+import logging
 import os
 import re
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor
@@ -36,15 +38,27 @@ def start(
     """
     options = parse(kind, description)
     tune_process()
+    traced = bool(os.environ.get("GINN_JAX_TRACEBACK"))
+    if not traced:
+        silence_threads()
     try:
         main(hasten(options, quick))
     except KeyboardInterrupt:
         fail("stopped", 130)
     except Exception as error:
         code, message = explain(error)
-        if code == 1 and os.environ.get("GINN_JAX_TRACEBACK"):
+        if code == 1 and traced:
             raise
         fail(message, code)
+
+
+def silence_threads() -> None:
+    """Let no thread print a traceback: what matters of it reaches the main one.
+
+    TensorStore's and orbax's would where a checkpoint turns out to be damaged.
+    """
+    sys.excepthook = threading.excepthook = sys.unraisablehook = lambda *_: None
+    logging.getLogger("absl").setLevel(logging.CRITICAL)
 
 
 def explain(error: Exception) -> tuple[int, str]:

@@ -1,5 +1,6 @@
 """The training loop of a run: clouds in, weights out, resumable at any step."""
 
+import io
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ import jax
 import numpy as np
 
 from ginn_jax.checkpoint import (
+    finish,
     load_run,
     open_manager,
     restore_state,
@@ -118,7 +120,7 @@ def fit(
             save_losses(folder, history)
             save_run(folder, config, limits, extra or {})
             save_state(manager, state)
-    manager.close()
+    finish(manager)
     return Fit(state, limits, np.array(history, np.float32), seconds, raised)
 
 
@@ -140,8 +142,10 @@ def training_limits(config: Training, clouds: Sequence[Cloud]) -> Limits:
 
 def save_losses(folder: Path, history: Sequence[float]) -> None:
     """Keep the loss of every step beside the checkpoints."""
-    with writing(folder / "losses.npy") as partial, open(partial, "wb") as file:
-        np.save(file, np.asarray(history, np.float32))
+    # In memory first: NumPy does not hear of a disk that is full.
+    np.save(whole := io.BytesIO(), np.asarray(history, np.float32))
+    with writing(folder / "losses.npy") as partial:
+        partial.write_bytes(whole.getvalue())
 
 
 def load_losses(folder: Path, steps: int) -> np.ndarray:

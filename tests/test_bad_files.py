@@ -124,7 +124,7 @@ def run(record=None, text=None, damage=None):
 def save_state(folder, state=STATE):
     manager = checkpoint.open_manager(folder)
     checkpoint.save_state(manager, state)
-    manager.close()
+    checkpoint.finish(manager)
 
 
 def restore(folder, like=STATE):
@@ -244,15 +244,11 @@ ROWS = [
             ("face 2 2 3", ("0", 2), "zero area; give triangles with an area"),
         )
     ),
-    Row(
-        "no meshes", directory("none"), mesh.find_meshes, "no mesh in this folder; put"
-    ),
-    Row("no folder", missing("gone"), mesh.find_meshes, "no such file or folder; give"),
+    Row("no meshes", directory("none"), mesh.find_meshes, "no mesh in this folder"),
+    Row("no folder", missing("gone"), mesh.find_meshes, "no such file or folder"),
     # Points
     Row("no rows", holds(POINTS.format(0), "p.ply"), mesh.load_points, "export|save"),
-    Row(
-        "5 rows, 1 there", holds(ONE_POINT.format(5), "p.ply"), mesh.load_points, "cut"
-    ),
+    Row("5 rows, 1 there", holds(ONE_POINT.format(5), "p.ply"), mesh.load_points, "cu"),
     Row(
         "no normals",
         holds(ONE_POINT.format(1).replace(" nx", " a"), "p.ply"),
@@ -268,9 +264,7 @@ ROWS = [
     Row("a mesh", holds(PLY, "p.ply"), mesh.load_points, "a mesh, .* use load_mesh"),
     # Environment maps
     Row("no HDR", missing("a.hdr"), MAP, "no such file; give an environment map"),
-    Row(
-        "no maps", directory("none"), lighting.find_environments, "no .hdr, .exr, .pfm"
-    ),
+    Row("no maps", directory("none"), lighting.find_environments, "no .hdr, .exr"),
     *(
         Row(f"{name} of {value}", image(name, value), MAP, said)
         for name in ("a.exr", "a.pfm")
@@ -294,9 +288,7 @@ ROWS = [
     Row("shard with a pickle", pickled, GREY, "damaged: delete it"),
     Row("lit: pickle", pickled, LIT, "damaged: delete it"),
     Row("shard is a folder", directory("a.npz"), GREY, "Is a directory.*: mend that"),
-    Row(
-        "of 2D points", shard(position=np.ones((20, 2))), GREY, "another kind of cloud"
-    ),
+    Row("of 2D points", shard(position=np.ones((20, 2))), GREY, "another kind"),
     Row("of unequal rows", shard(target=np.ones(19)), GREY, "another kind of cloud"),
     Row("of words", shard(target=np.array(["a"] * 20)), GREY, "another kind of cloud"),
     Row("without target", shard(target=None), GREY, "another kind of cloud"),
@@ -310,12 +302,15 @@ ROWS = [
     Row("record, limit inf", run({"limits": {"a": np.inf}}), resume, "damaged: delete"),
     Row("record, limit -1", run({"limits": {"a": -1}}), resume, "damaged: delete"),
     *(
-        Row(
-            f"record, {n} {v}", with_training(**{n: v}), checkpoint.load_weights, "dama"
-        )
+        Row(f"record, {n} {v}", with_training(**{n: v}), checkpoint.load_weights, "dam")
         for n, v in (("steps", 0), ("points", "many"), ("network", {"levels": []}))
     ),
-    Row("checkpoint of another shape", run(), restore_wider, "3 cannot be read"),
+    Row(
+        "checkpoint of another shape",
+        run(),
+        restore_wider,
+        "not of this network: .*encoder.kernel",
+    ),
     Row("half a checkpoint", run(damage=halve_checkpoint), restore, "3 cannot be read"),
     Row("weights of another shape", run(), checkpoint.load_weights, "cannot be read"),
 ]
