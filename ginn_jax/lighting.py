@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ginn_jax import radiance_files
 from ginn_jax.checks import LARGEST, LARGEST_SEED, number, real_array, vector, whole
 from ginn_jax.errors import InputError
 from ginn_jax.files import check_file
@@ -61,14 +62,18 @@ def load_environment(path: str | Path) -> EnvironmentMap:
     """
     path = Path(path)
     check_file(path, "an environment map")
+    with open(path, "rb") as file:
+        radiance = file.read(2) == radiance_files.MAGIC
+        if radiance and not radiance_files.is_whole(b"#?" + file.read()):
+            raise InputError(f"{path}: cannot be read (damaged); export it anew")
     mi, variant = use_mitsuba()
     with mi.variant_context(variant):
         try:
             bitmap = mi.Bitmap(str(path))
             kind = mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32
             pixels = np.array(bitmap.convert(*kind, srgb_gamma=False))
-        except (RuntimeError, MemoryError) as error:
-            reason = str(error).strip().splitlines()[-1]
+        except Exception as error:  # its readers raise what they like
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
             raise InputError(f"{path}: cannot be read ({reason})") from None
     try:
         return make_environment(pixels)
