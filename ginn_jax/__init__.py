@@ -16,7 +16,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     camera            pinhole cameras
     libllvm, renderer the ray tracer, found and loaded
     reference         ambient occlusion and G-buffers by ray tracing
-    radiance_files    whether an HDR file is whole
+    radiance_files    what the renderer does not check of a map's file
     lighting          environment maps, procedural skies and studios, point lights
     irradiance        direct and indirect irradiance by path tracing
     slab              albedo of a thick slab of a medium, and its inverse

@@ -62,10 +62,8 @@ def load_environment(path: str | Path) -> EnvironmentMap:
     """
     path = Path(path)
     check_file(path, "an environment map")
-    with open(path, "rb") as file:
-        radiance = file.read(2) == radiance_files.MAGIC
-        if radiance and not radiance_files.is_whole(b"#?" + file.read()):
-            raise InputError(f"{path}: cannot be read (damaged); export it anew")
+    if not radiance_files.is_sound(path.read_bytes()):
+        raise InputError(f"{path}: cannot be read (damaged); export it anew")
     mi, variant = use_mitsuba()
     with mi.variant_context(variant):
         try:

@@ -23,7 +23,7 @@ from ginn_jax.checks import (
     whole,
 )
 from ginn_jax.errors import InputError, InputWarning
-from ginn_jax.mesh_files import load_scene
+from ginn_jax.mesh_files import load_scene, merge, readable
 
 GROUND_GAP = 1e-4
 # Clouds on disk number materials by a byte.
@@ -80,7 +80,7 @@ def load_mesh(path: str | Path) -> Mesh:
     Raises `InputError` where the file is missing, unreadable or has no triangles.
     """
     scene = load_scene(Path(path))
-    merged = scene.to_mesh()
+    merged = merge(Path(path), scene)
     if not isinstance(merged, trimesh.Trimesh) or len(merged.faces) == 0:
         if any(isinstance(g, trimesh.PointCloud) for g in scene.geometry.values()):
             raise InputError(f"{path}: a point cloud, no triangles; use load_points")
@@ -108,14 +108,16 @@ def load_points(path: str | Path) -> Samples:
     if len(clouds) != 1 or "_ply_raw" not in clouds[0].metadata:
         raise InputError(f"{path}: no PLY point cloud in it; save the points as PLY")
     columns = clouds[0].metadata["_ply_raw"]["vertex"]["data"]
-    position = np.asarray(clouds[0].vertices, np.float32)
+    with readable(Path(path)):
+        position = np.asarray(clouds[0].vertices, np.float32).reshape(-1, 3)
     try:
         normal = np.stack([np.ravel(columns[axis]) for axis in ("nx", "ny", "nz")], -1)
-    except (KeyError, ValueError):
+        normal = normal.astype(np.float64)
+    except (KeyError, ValueError, TypeError):
         raise InputError(
             f"{path}: the points have no normals; estimate them and save nx, ny, nz"
         ) from None
-    length = np.linalg.norm(normal.astype(np.float64), axis=1, keepdims=True)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
     usable = np.isfinite(position).all(1) & np.isfinite(length[:, 0])
     if bad := int((~usable | (length[:, 0] == 0)).sum()):
         raise InputError(

@@ -1,17 +1,36 @@
-"""Whether a Radiance file (.hdr) is whole: Mitsuba writes past its rows if not.
+"""What Mitsuba's readers of environment maps do not check of a file before they act.
 
-A run that is longer than its row corrupts the memory of the process there (Mitsuba
-3.9.1), so every run is counted before that reader sees the file.
+A run longer than its row, in a Radiance file (.hdr), makes its reader write past the
+row and corrupts the process; an OpenEXR file is given as much memory as it says it
+needs (both Mitsuba 3.9.1).
 """
 
 import re
+import struct
 
-MAGIC = b"#?"
 SIZE = re.compile(rb"-Y (\d{1,6}) \+X (\d{1,6})\n")
+WINDOW = re.compile(rb"dataWindow\0box2i\0\x10\0\0\0(.{16})", re.DOTALL)
+MOST_PIXELS = 2**28
 
 
-def is_whole(content: bytes) -> bool:
-    """Whether all rows are there and no run is longer than its row."""
+def is_sound(content: bytes) -> bool:
+    """Whether a file of any format can be given to Mitsuba."""
+    if content.startswith(b"#?"):
+        return _all_runs_fit(content)
+    if content.startswith(b"v/1\x01"):
+        return _has_bounds(content)
+    return True
+
+
+def _has_bounds(content: bytes) -> bool:
+    """Whether an OpenEXR file says of all its parts that they have so many pixels."""
+    boxes = [struct.unpack("<4i", found) for found in WINDOW.findall(content)]
+    areas = [(right - x + 1) * (low - y + 1) for x, y, right, low in boxes]
+    return bool(areas) and all(0 < area <= MOST_PIXELS for area in areas)
+
+
+def _all_runs_fit(content: bytes) -> bool:
+    """Whether a Radiance file has all its rows, and no run longer than its row."""
     start = content.find(b"\n\n") + 2
     size = SIZE.match(content, start) if start > 1 else None
     if size is None:

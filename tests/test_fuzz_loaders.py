@@ -179,15 +179,24 @@ def test_any_record_of_json_is_a_run_or_refused(data):
     assert found is None  # there is no checkpoint
 
 
-@settings(parent=MANY, max_examples=25)
-@given(st.data())
-def test_any_checkpoint_is_a_state_or_refused(data):
+@cache
+def saved():
+    """The files of a good checkpoint."""
     with TemporaryDirectory() as folder:
         save_state(Path(folder))
         files = sorted(p for p in Path(folder).rglob("*") if p.is_file())
-        path = data.draw(st.sampled_from(files))
-        whole = path.read_bytes()
-        path.write_bytes(data.draw(spoiled(whole or b"\0")))
+        return {p.relative_to(folder): p.read_bytes() for p in files}
+
+
+@settings(parent=MANY, max_examples=25)
+@given(st.data())
+def test_any_checkpoint_is_a_state_or_refused(data):
+    name = data.draw(st.sampled_from(list(saved())))
+    content = data.draw(spoiled(saved()[name] or b"0"))
+    with TemporaryDirectory() as folder:
+        for path, whole in saved().items():
+            (Path(folder) / path).parent.mkdir(parents=True, exist_ok=True)
+            (Path(folder) / path).write_bytes(content if path == name else whole)
         try:
             found = restore(Path(folder))
         except InputError as error:
