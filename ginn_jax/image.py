@@ -72,10 +72,11 @@ def check_numbers(name: str, numbers: Any, width: int, rows: int) -> None:
     """Raise `InputError` unless so many numbers come with each of these points."""
     if width == 0 and numbers is not None:
         raise InputError(f"the network takes no {name}: leave it out")
-    shape = np.shape(real_array(name, () if numbers is None else numbers))
+    given = real_array(name, () if numbers is None else numbers)
+    shape = given.shape
     if width and (len(shape) != 3 or shape[1:] != (rows, width)):
         raise InputError(f"{name} is {shape}, the network takes [C {rows} {width}]")
-    if width and not np.isfinite(numbers).all():
+    if width and not np.isfinite(given).all():
         raise InputError(f"{name} holds non-finite numbers: remove those points")
 
 

@@ -16,7 +16,6 @@ from trimesh.exchange.load import mesh_formats
 from ginn_jax import orientation
 from ginn_jax.checks import (
     LARGEST_INDEX,
-    LARGEST_SEED,
     positive,
     real_array,
     unit_rows,
@@ -179,7 +178,7 @@ def add_ground(mesh: Mesh, half_extent: float = 0.8) -> Mesh:
 def sample_surface(mesh: Mesh, count: int, *, seed: int) -> Samples:
     """`count` points uniform by area, with the normals and materials of their faces."""
     whole("count", count, 0, LARGEST_INDEX)
-    whole("seed", seed, 0, LARGEST_SEED)
+    whole("seed", seed, 0, 2**63 - 1)
     check_mesh(mesh)
     shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     position, face = trimesh.sample.sample_surface(shape, count, seed=seed)[:2]
@@ -202,7 +201,7 @@ def add_ground_samples(
     ground so large that its samples cannot be numbered.
     """
     half_extent = positive("half_extent", half_extent)
-    whole("seed", seed, 0, LARGEST_SEED)
+    whole("seed", seed, 0, 2**63 - 1)
     unit_rows(samples.position, samples.normal)
     if len(samples.position) < 9:
         raise InputError("point cloud: fewer than 9 points; give a denser one")
