@@ -8,12 +8,15 @@ After "Deep-learning the Latent Space of Light Transport" (EGSR 2019).
 Modules, in the order the data flows; each imports only what stands before it:
 
     errors            the exception for mistakes in the user's input
+    checks            what public functions ask of their arguments
+    files             checked before they are read, written whole or not
     process           settings of a process that make XLA faster on CPU
-    orientation, mesh triangles: loading, mending, unit box, ground, surface samples
+    orientation, mesh_files, mesh    triangles: loading, mending, ground, samples
     sdf, solids, *_shapes, shapes    the seeded source of procedural objects
     camera            pinhole cameras
     libllvm, renderer the ray tracer, found and loaded
     reference         ambient occlusion and G-buffers by ray tracing
+    radiance_files    what the renderer does not check of a map's file
     lighting          environment maps, procedural skies and studios, point lights
     irradiance        direct and indirect irradiance by path tracing
     slab              albedo of a thick slab of a medium, and its inverse

@@ -3,9 +3,11 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from ginn_jax.checks import one_of, positive, whole
 from ginn_jax.errors import InputError
 
 QUERY = -1
+WIDEST = 4096
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,12 @@ class Conv:
     before: Literal["raw", "norm", "dense", "lift"] = "dense"
     mixes: bool = False
     skip: str | None = None
+
+    def __post_init__(self) -> None:
+        positive(f"radius of {self.name}", self.radius)
+        positive(f"bandwidth of {self.name}", self.bandwidth)
+        whole(f"channels of {self.name}", self.channels, 1, WIDEST)
+        one_of(f"before of {self.name}", self.before, ("raw", "norm", "dense", "lift"))
 
 
 @dataclass(frozen=True)
@@ -73,8 +81,28 @@ class Network:
     splat: bool = False
 
     def __post_init__(self) -> None:
+        """Raise `InputError` for what is no network, wherever it was read."""
         if self.splat and self.linear:
             raise InputError("a network that splats cannot be linear: choose one")
+        if not self.levels or list(self.levels) != sorted(self.levels):
+            raise InputError(f"levels {self.levels}: give at least one, finest first")
+        for radius in self.levels:
+            positive("level", radius)
+        for name, least in (("latent", 1), ("head", 1), ("hidden", 1), ("group", 0)):
+            whole(name, getattr(self, name), least, WIDEST)
+        for name in ("materials", "lights"):
+            whole(name, getattr(self, name), 0, WIDEST)
+        one_of("density", self.density, ("kde", "surface"))
+        one_of("norm", self.norm, ("batch", "layer", "none"))
+        one_of("asks", self.asks, ("normal", "all"))
+        named = set()
+        for conv in (*self.encoder, self.query):
+            least = QUERY if conv is self.query else 0
+            whole(f"source of {conv.name}", conv.source, 0, len(self.levels) - 1)
+            whole(f"target of {conv.name}", conv.target, least, len(self.levels) - 1)
+            if conv.skip is not None:
+                one_of(f"skip of {conv.name}", conv.skip, tuple(named))
+            named.add(conv.name)
 
 
 def released_table(k: int, radii: tuple[float, ...]) -> tuple[Conv, ...]:

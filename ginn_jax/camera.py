@@ -5,7 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from ginn_jax.checks import LARGEST, number, positive, vector, whole
 from ginn_jax.errors import InputError
+
+MOST_PIXELS = 2**28
 
 
 @dataclass(frozen=True)
@@ -23,17 +26,14 @@ class Camera:
     height: int = 512
 
     def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1:
-            raise InputError(
-                f"camera of {self.width} x {self.height} pixels: "
-                "width and height must be at least 1"
-            )
-        if not 0 < self.vertical_fov < 180:
+        width = whole("camera's width", self.width, 1, MOST_PIXELS)
+        whole("camera's height", self.height, 1, MOST_PIXELS // width)
+        if not 0 < number("camera's vertical_fov", self.vertical_fov, 0.0, 180.0) < 180:
             raise InputError(
                 f"camera's vertical_fov {self.vertical_fov} must be inside (0, 180)"
             )
-        if not np.isfinite([self.origin, self.target, self.up]).all():
-            raise InputError("camera's origin, target and up must be finite")
+        for name in ("origin", "target", "up"):
+            vector(f"camera's {name}", getattr(self, name))
         forward = np.subtract(self.target, self.origin)
         least = 1e-6 * np.linalg.norm(forward) * np.linalg.norm(self.up)
         if not np.linalg.norm(np.cross(forward, self.up)) > least:
@@ -55,10 +55,11 @@ def orbit_camera(
     `azimuth` is measured from +z towards +x and `elevation` from the horizon, both in
     degrees (elevation strictly between -90 and 90); `distance` in box sides.
     """
-    if not -90 < elevation < 90:
+    number("azimuth", azimuth, -LARGEST)
+    if not -90 < number("elevation", elevation, -90.0, 90.0) < 90:
         raise InputError(f"elevation {elevation} looks along up: stay inside (-90, 90)")
-    if not distance > 0:
-        raise InputError(f"distance {distance} of a camera must be positive")
+    positive("distance", distance)
+    vector("target", target)
     a, e = np.radians(azimuth), np.radians(elevation)
     away = np.array([np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)])
     x, y, z = (np.asarray(target) + distance * away).tolist()

@@ -2,8 +2,10 @@
 
 import json
 import shutil
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +14,15 @@ import orbax.checkpoint as ocp
 from jax.sharding import SingleDeviceSharding
 
 from ginn_jax.architecture import Conv, Network
+from ginn_jax.checks import LARGEST_INDEX, whole
 from ginn_jax.errors import InputError
+from ginn_jax.files import unwritable, writing
 from ginn_jax.geometry import Limits, limit_names
 from ginn_jax.network import Variables
 from ginn_jax.train import Training, TrainState, state_shapes
 
 KEPT = 2
+CHECKPOINTS, RECORD = "checkpoints", "run.json"
 
 
 def open_manager(folder: Path, fresh: bool = False) -> ocp.CheckpointManager:
@@ -25,18 +30,50 @@ def open_manager(folder: Path, fresh: bool = False) -> ocp.CheckpointManager:
 
     `fresh` removes those of an earlier run.
     """
-    path = (folder / "checkpoints").absolute()
-    if fresh and path.exists():
-        shutil.rmtree(path)
-    options = ocp.CheckpointManagerOptions(max_to_keep=KEPT, create=True)
-    return ocp.CheckpointManager(path, options=options)
+    path = (folder / CHECKPOINTS).absolute()
+    options = ocp.CheckpointManagerOptions(
+        max_to_keep=KEPT, create=True, cleanup_tmp_directories=True
+    )
+    try:
+        if fresh and path.exists():
+            shutil.rmtree(path)
+        handler = ocp.StandardCheckpointHandler()
+        return ocp.CheckpointManager(path, options=options, item_handlers=handler)
+    except OSError as error:
+        raise InputError(unwritable(path, error)) from None
 
 
 def save_state(manager: ocp.CheckpointManager, state: TrainState) -> None:
-    """Write the state under its step number, unless it is there."""
+    """Start to write the state under its step number, unless it is there.
+
+    Raises:
+        InputError: the one before could not be written.
+    """
     step = int(state.step)
     if step not in manager.all_steps():
-        manager.save(step, args=ocp.args.StandardSave(state._asdict()))
+        with _whole_or_none(manager):
+            manager.save(step, args=ocp.args.StandardSave(state._asdict()))
+
+
+def finish(manager: ocp.CheckpointManager) -> None:
+    """Wait until all is written; `InputError` where it could not be."""
+    with _whole_or_none(manager):
+        manager.close()
+
+
+@contextmanager
+def _whole_or_none(manager: ocp.CheckpointManager) -> Iterator[None]:
+    """Remove what was written of a checkpoint if the rest cannot be."""
+    try:
+        yield
+    except Exception as error:  # TensorStore says it by ValueError
+        folder = Path(str(manager.directory))
+        for half in folder.glob("*.orbax-checkpoint-tmp"):
+            shutil.rmtree(half, ignore_errors=True)
+        why = " ".join(str(error).split())[-80:]
+        raise InputError(
+            f"{folder}: checkpoint cannot be written ({why}): make room, then --resume"
+        ) from None
 
 
 def restore_state(
@@ -52,6 +89,8 @@ def restore_state(
         return None
     shapes = jax.tree.map(_shape_of, like._asdict())
     try:
+        # TensorStore would say it as well, after tracebacks of its own.
+        _check_shapes(manager.item_metadata(step), shapes)
         found = manager.restore(step, args=ocp.args.StandardRestore(shapes))
     except Exception as error:
         folder = Path(str(manager.directory)) / str(step)
@@ -60,6 +99,21 @@ def restore_state(
             f"checkpoint {folder} cannot be read ({reason}): delete it or start anew"
         ) from None
     return TrainState(**found)
+
+
+def _check_shapes(found: Any, wanted: Any) -> None:
+    """Raise `ValueError` unless the checkpoint has arrays of these shapes."""
+    there, here = _shapes_by_name(found), _shapes_by_name(wanted)
+    for name, shape in sorted((there | here).items()):
+        if there.get(name) != here.get(name):
+            raise ValueError(f"not of this network: {name} {shape}")
+
+
+def _shapes_by_name(tree: Any) -> dict[str, tuple[int, ...]]:
+    """Orbax turns tuples with names into dicts: what is left is names and shapes."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    name = partial(jax.tree_util.keystr, simple=True, separator=".")
+    return {name(path): tuple(leaf.shape) for path, leaf in leaves}
 
 
 def _shape_of(leaf: Any) -> jax.ShapeDtypeStruct:
@@ -73,9 +127,8 @@ def save_run(
     """Write what a resumed run must agree with: configuration and capacities."""
     record = {"training": asdict(config), "limits": dict(limits.sizes), **extra}
     text = json.dumps(record, indent=1, sort_keys=True)
-    temporary = folder / "run.json.partial"
-    temporary.write_text(text)
-    temporary.replace(folder / "run.json")
+    with writing(folder / RECORD) as new:
+        new.write_text(text)
 
 
 def load_run(folder: Path, config: Training, extra: dict[str, Any]) -> Limits:
@@ -84,17 +137,11 @@ def load_run(folder: Path, config: Training, extra: dict[str, Any]) -> Limits:
     Raises:
         InputError: no run there, an unreadable record, or other settings than now.
     """
-    path = folder / "run.json"
-    try:
-        record = json.loads(path.read_text())
+    path = folder / RECORD
+    record = read_record(path, "no run to resume: leave out --resume")
+    with damaged(path, "delete it and start anew"):
         training = dict(record["training"])
-        limits = Limits(tuple((k, int(v)) for k, v in record["limits"].items()))
-    except FileNotFoundError:
-        raise InputError(
-            f"{folder} holds no run to resume: leave out --resume"
-        ) from None
-    except (ValueError, KeyError, AttributeError, TypeError):
-        raise InputError(f"{path} is damaged: delete it and start anew") from None
+        limits = limits_from(record)
     wanted = json.loads(json.dumps({"training": asdict(config), **extra}))
     for name in sorted(wanted["training"]):
         if training.get(name) != wanted["training"][name]:
@@ -122,16 +169,14 @@ def load_weights(folder: Path) -> tuple[Training, Limits, Variables]:
     Raises:
         InputError: no run there, no checkpoint yet, or a damaged file.
     """
-    path = folder / "run.json"
-    try:
-        record = json.loads(path.read_text())
+    path = folder / RECORD
+    record = read_record(path, "no run: name the --out of one")
+    with damaged(path, "train again"):
         config = training_from(record["training"])
-        limits = Limits(tuple((k, int(v)) for k, v in record["limits"].items()))
-    except FileNotFoundError:
-        raise InputError(f"{folder} holds no run: name the --out of one") from None
-    except (ValueError, KeyError, AttributeError, TypeError):
-        raise InputError(f"{path} is damaged: train again") from None
+        limits = limits_from(record)
     check_names(path, config.network, limits)
+    if not (folder / CHECKPOINTS).is_dir():
+        raise InputError(f"{folder} holds no checkpoint yet: let its run go on")
     here = SingleDeviceSharding(jax.devices()[0])
     like = jax.tree.map(
         lambda s: jax.ShapeDtypeStruct(s.shape, s.dtype, sharding=here),
@@ -142,6 +187,38 @@ def load_weights(folder: Path) -> tuple[Training, Limits, Variables]:
     if state is None:
         raise InputError(f"{folder} holds no checkpoint yet: let its run go on")
     return config, limits, state.variables
+
+
+def read_record(path: Path, missing: str) -> Any:
+    """What `save_run` wrote; None where that is not JSON."""
+    try:
+        with open(path, "rb") as file:
+            if file.read(1) != b"{":
+                return None
+            return json.loads(b"{" + file.read())
+    except FileNotFoundError:
+        raise InputError(f"{path.parent} holds {missing}") from None
+    except OSError as error:
+        raise InputError(
+            f"{path} cannot be read ({error.strerror}): mend that or choose another"
+        ) from None
+    except (ValueError, RecursionError):
+        return None
+
+
+@contextmanager
+def damaged(path: Path, mend: str) -> Iterator[None]:
+    """Say of a record without what should be in it that it is damaged."""
+    try:
+        yield
+    except (ValueError, KeyError, AttributeError, TypeError, OverflowError):
+        raise InputError(f"{path} is damaged: {mend}") from None
+
+
+def limits_from(record: dict[str, Any]) -> Limits:
+    """The capacities that `save_run` wrote."""
+    sizes = record["limits"].items()
+    return Limits(tuple((name, whole(name, n, 1, LARGEST_INDEX)) for name, n in sizes))
 
 
 def training_from(record: dict[str, Any]) -> Training:

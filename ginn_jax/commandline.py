@@ -2,14 +2,20 @@
 
 import contextlib
 import io
+import logging
+import os
 import re
 import sys
+import threading
+import traceback
 from collections.abc import Callable, Mapping
+from concurrent.futures import BrokenExecutor
 from dataclasses import fields, replace
 from typing import Any, TypeVar
 
 import tyro
 
+from ginn_jax.checks import LARGEST_INDEX
 from ginn_jax.errors import InputError
 from ginn_jax.process import tune_process
 
@@ -23,13 +29,54 @@ def start(
     quick: Mapping[str, Any],
     description: str | None = None,
 ) -> None:
-    """Run a script: mistakes in its options or input end in one line and code 2."""
+    """Run a script; whatever ends it is said in one line, without a traceback.
+
+    The exit code is 2 where the user can mend it: options, input, a disk that is full
+    or not to be written to, too little memory. It is 1 where the mistake is ours, and
+    130 where Ctrl-C stopped the run. With GINN_JAX_TRACEBACK set, what is ours comes
+    with its traceback.
+    """
     options = parse(kind, description)
     tune_process()
+    traced = bool(os.environ.get("GINN_JAX_TRACEBACK"))
+    if not traced:
+        silence_threads()
     try:
         main(hasten(options, quick))
-    except InputError as error:
-        fail(str(error))
+    except KeyboardInterrupt:
+        fail("stopped", 130)
+    except Exception as error:
+        code, message = explain(error)
+        if code == 1 and traced:
+            raise
+        fail(message, code)
+
+
+def silence_threads() -> None:
+    """Let no thread print a traceback: what matters of it reaches the main one.
+
+    TensorStore's and orbax's would where a checkpoint turns out to be damaged.
+    """
+    sys.excepthook = threading.excepthook = sys.unraisablehook = lambda *_: None
+    logging.getLogger("absl").setLevel(logging.CRITICAL)
+
+
+def explain(error: Exception) -> tuple[int, str]:
+    """Exit code and message for what ended a script."""
+    if isinstance(error, InputError):
+        return 2, str(error)
+    if isinstance(error, OSError) and error.errno is not None:
+        place = f"{error.filename}: " if error.filename else ""
+        return 2, f"{place}{error.strerror}; make room or name another place"
+    if isinstance(error, MemoryError | BrokenExecutor):
+        return 2, f"not enough memory ({error}); ask for fewer points or pixels"
+    said = " ".join(str(error).split())[:300]
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    where = f"{os.path.basename(frame.filename)}:{frame.lineno}"
+    return 1, (
+        f"a mistake of ours, {type(error).__name__} at {where}: {said}; please report "
+        "it with what GINN_JAX_TRACEBACK=1 shows"
+    )
 
 
 def parse(kind: type[Options], description: str | None) -> Options:
@@ -45,10 +92,10 @@ def parse(kind: type[Options], description: str | None) -> Options:
         raise
 
 
-def fail(message: str) -> None:
-    """Print one line and leave with exit code 2."""
+def fail(message: str, code: int = 2) -> None:
+    """Print one line and leave with that exit code."""
     print(f"error: {message}", file=sys.stderr)
-    sys.exit(2)
+    sys.exit(code)
 
 
 def hasten(options: Any, quick: Mapping[str, Any]) -> Any:
@@ -68,10 +115,10 @@ def require_positive(options: Any, name: str) -> None:
 
 
 def require(options: Any, least: Mapping[str, int]) -> None:
-    """Raise `InputError` for the first option below its least value."""
+    """Raise `InputError` for the first option below its least value, or beyond all."""
     for name, minimum in least.items():
-        if getattr(options, name) < minimum:
-            flag = name.replace("_", "-")
-            raise InputError(
-                f"--{flag} is {getattr(options, name)}: give at least {minimum}"
-            )
+        flag, value = name.replace("_", "-"), getattr(options, name)
+        if value < minimum:
+            raise InputError(f"--{flag} is {value}: give at least {minimum}")
+        if value > LARGEST_INDEX:
+            raise InputError(f"--{flag} is {value}: give at most {LARGEST_INDEX}")

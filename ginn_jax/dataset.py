@@ -1,9 +1,8 @@
 """Shaded points, the one type for a cloud and a G-buffer, and clouds on disk."""
 
 import json
-import os
-import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,13 +12,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ginn_jax.errors import InputError
+from ginn_jax.files import writing
 from ginn_jax.receptive_field import Oriented
 
 # Clouds of a batch stand this far apart: more than any radius and both extents.
 SPACING = 4.0
-
-# What `np.load` raises for a damaged archive, beside the obvious.
-_DAMAGE = (zipfile.BadZipFile, RuntimeError, TypeError)
 
 
 class ShadedPoints(NamedTuple):
@@ -48,11 +45,12 @@ def save_cloud(path: Path, cloud: ShadedPoints, origin: dict[str, Any]) -> None:
 def save_arrays(
     path: Path, arrays: dict[str, np.ndarray], origin: dict[str, Any]
 ) -> None:
-    """Write named arrays and what made them, atomically."""
-    partial = path.with_suffix(f".{os.getpid()}.partial")
-    with open(partial, "wb") as file:
+    """Write named arrays and what made them, atomically.
+
+    Raises `InputError` where the disk is full or may not be written to.
+    """
+    with writing(path) as partial, open(partial, "wb") as file:
         np.savez(file, origin=json.dumps(origin, sort_keys=True), **arrays)  # type: ignore[arg-type]
-    os.replace(partial, path)
 
 
 def load_cloud(path: Path, origin: dict[str, Any] | None = None) -> ShadedPoints:
@@ -62,23 +60,54 @@ def load_cloud(path: Path, origin: dict[str, Any] | None = None) -> ShadedPoints
         InputError: a missing or damaged file, or one made by something else than
             `origin`.
     """
+    with another_kind(path):
+        cloud = ShadedPoints(**load_arrays(path, origin))
+        check_rows(cloud._asdict(), {"position": 3, "normal": 3})
+    return cloud
+
+
+@contextmanager
+def another_kind(path: Path) -> Iterator[None]:
+    """Say of arrays that make no cloud of the kind wanted what to do about them."""
     try:
-        return ShadedPoints(**load_arrays(path, origin))
-    except TypeError:
+        yield
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError, IndexError):
         raise InputError(
             f"{path} holds another kind of cloud: choose another folder"
         ) from None
 
 
+def check_rows(columns: dict[str, Any], widths: dict[str, int]) -> None:
+    """Raise `ValueError` unless these are numbers of the same points.
+
+    `widths` says how many numbers a point has in a column: else any, or one.
+    """
+    count = len(columns["position"])
+    for name, column in columns.items():
+        if column is None:
+            continue
+        width = column.shape[1:]
+        if len(column) != count or column.dtype.kind not in "fi" or len(width) > 1:
+            raise ValueError(name)
+        if name in widths and width != (widths[name],):
+            raise ValueError(name)
+
+
 def load_arrays(path: Path, origin: dict[str, Any] | None) -> dict[str, np.ndarray]:
     """Read named arrays back; `InputError` as in `load_cloud`."""
     try:
-        with np.load(path) as file:
+        with np.load(path, allow_pickle=False) as file:
             found = json.loads(str(file["origin"]))
             arrays = {name: file[name] for name in file.files if name != "origin"}
     except FileNotFoundError:
         raise InputError(f"{path}: no such cloud") from None
-    except (OSError, ValueError, KeyError, EOFError, *_DAMAGE):
+    except (PermissionError, IsADirectoryError) as error:
+        raise InputError(
+            f"{path} cannot be read ({error.strerror}): mend that or choose another"
+        ) from None
+    except Exception:  # zipfile, zlib, NumPy and json each raise what they like
         raise InputError(
             f"{path} is damaged: delete it to have it made again"
         ) from None

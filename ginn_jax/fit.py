@@ -1,5 +1,6 @@
 """The training loop of a run: clouds in, weights out, resumable at any step."""
 
+import io
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ import jax
 import numpy as np
 
 from ginn_jax.checkpoint import (
+    finish,
     load_run,
     open_manager,
     restore_state,
@@ -18,6 +20,7 @@ from ginn_jax.checkpoint import (
 )
 from ginn_jax.dataset import ShadedPoints, batch_order, stack_clouds
 from ginn_jax.errors import InputError
+from ginn_jax.files import writing
 from ginn_jax.geometry import (
     Limits,
     exceeded,
@@ -117,7 +120,7 @@ def fit(
             save_losses(folder, history)
             save_run(folder, config, limits, extra or {})
             save_state(manager, state)
-    manager.close()
+    finish(manager)
     return Fit(state, limits, np.array(history, np.float32), seconds, raised)
 
 
@@ -139,14 +142,18 @@ def training_limits(config: Training, clouds: Sequence[Cloud]) -> Limits:
 
 def save_losses(folder: Path, history: Sequence[float]) -> None:
     """Keep the loss of every step beside the checkpoints."""
-    np.save(folder / "losses.npy", np.asarray(history, np.float32))
+    # In memory first: NumPy does not hear of a disk that is full.
+    np.save(whole := io.BytesIO(), np.asarray(history, np.float32))
+    with writing(folder / "losses.npy") as partial:
+        partial.write_bytes(whole.getvalue())
 
 
 def load_losses(folder: Path, steps: int) -> np.ndarray:
     """The losses of the first `steps` steps; NaN where the file lacks them."""
     try:
-        found = np.load(folder / "losses.npy")[:steps]
-    except (OSError, ValueError):
+        found = np.load(folder / "losses.npy", allow_pickle=False)[:steps]
+        found = found.astype(np.float32).reshape(-1)
+    except Exception:  # NumPy raises what it likes
         found = np.zeros(0, np.float32)
     missing = np.full(steps - len(found), np.nan, np.float32)
     return np.concatenate([found, missing])

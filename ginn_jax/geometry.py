@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int, Key
 
 from ginn_jax.architecture import Conv, Network
+from ginn_jax.errors import InputError
 from ginn_jax.hierarchy import Level, LevelLimit, build_level
 from ginn_jax.packets import Demand, EdgeLimit, Edges, radius_edges
 from ginn_jax.receptive_field import (
@@ -37,7 +38,9 @@ class Limits:
 
     def of(self, name: str) -> int:
         """The capacity called `name`."""
-        return dict(self.sizes)[name]
+        if (size := dict(self.sizes).get(name)) is None:
+            raise InputError(f"the limits lack {name}: they are of another network")
+        return size
 
 
 class Geometry(NamedTuple):
@@ -105,8 +108,8 @@ def needs_areas(config: Network) -> bool:
 
 
 def area_search(config: Network) -> Conv:
-    """The search that tells it then: a convolution of no channels."""
-    return Conv("area", 0, 0, 2.5 * config.levels[0], 0.25, 0)
+    """The search that tells it then, as wide as a convolution's would be."""
+    return Conv("area", 0, 0, 2.5 * config.levels[0], 0.25, 1)
 
 
 def uniform_limits(config: Network, size: int) -> Limits:

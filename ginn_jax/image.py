@@ -6,12 +6,14 @@ too small they raise it and try again; the limits that sufficed come back for re
 """
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from ginn_jax.architecture import Network
+from ginn_jax.checks import LARGEST, number, real_array, unit_rows
 from ginn_jax.errors import InputError
 from ginn_jax.geometry import Limits, exceeded, limits_for, raise_limits
 from ginn_jax.neighbors import bucket, pad_rows
@@ -44,12 +46,14 @@ def encode_cloud(
     """Codes of a cloud, and the limits that sufficed.
 
     Raises:
-        InputError: an empty cloud, or one that is not finite.
+        InputError: an empty cloud, or one that is not finite; normals that are not of
+            unit length; material or light that the network does not take.
     """
-    if not len(position):
+    if not np.size(position):
         raise InputError("the cloud is empty: sample at least one point")
-    if not (np.isfinite(position).all() and np.isfinite(normal).all()):
-        raise InputError("the cloud holds non-finite numbers: remove those points")
+    unit_rows(position, normal, "the cloud")
+    check_numbers("material", material, network.materials, len(position))
+    check_numbers("light", light, network.lights, len(position))
     rows = bucket(len(position))
     padded, mask = pad_rows(np.asarray(position, np.float32), rows)
     turned, _ = pad_rows(np.asarray(normal, np.float32), rows)
@@ -62,6 +66,18 @@ def encode_cloud(
         if not short:
             return encoded, limits
         limits = raise_limits(limits, short, SLACK)
+
+
+def check_numbers(name: str, numbers: Any, width: int, rows: int) -> None:
+    """Raise `InputError` unless so many numbers come with each of these points."""
+    if width == 0 and numbers is not None:
+        raise InputError(f"the network takes no {name}: leave it out")
+    given = real_array(name, () if numbers is None else numbers)
+    shape = given.shape
+    if width and (len(shape) != 3 or shape[1:] != (rows, width)):
+        raise InputError(f"{name} is {shape}, the network takes [C {rows} {width}]")
+    if width and not np.isfinite(given).all():
+        raise InputError(f"{name} holds non-finite numbers: remove those points")
 
 
 def pad_channels(
@@ -98,13 +114,20 @@ def shade_points(
 
     With light they have a last axis of channels. `material` and `light` of the points
     themselves are needed only where the network asks for all.
+
+    Raises:
+        InputError: as `encode_cloud`, but for no points at all, which have no values.
     """
+    unit_rows(position, normal)
+    if network.asks == "all":
+        check_numbers("material", material, network.materials, len(position))
+        check_numbers("light", light, network.lights, len(position))
     copies = [jax.device_put((variables, encoded), d) for d in jax.devices()]
     size = min(BLOCK, bucket(len(position)))
     while True:
         parts, demands = [], []
         flat = only(limits, network.query.name)
-        for number, first in enumerate(range(0, len(position), size)):
+        for turn, first in enumerate(range(0, len(position), size)):
             block = slice(first, first + size)
             place, mask = pad_rows(np.asarray(position[block], np.float32), size)
             turned, _ = pad_rows(np.asarray(normal[block], np.float32), size)
@@ -113,7 +136,7 @@ def shade_points(
                 None if a is None else pad_channels(a[:, block], size)
                 for a in (material, light)
             )
-            arrays = copies[number % len(copies)]
+            arrays = copies[turn % len(copies)]
             values, demand = shade_block(network, flat, *arrays, queries, *numbers)
             parts.append(values)
             demands.append(demand)
@@ -149,8 +172,18 @@ def shade_image(
     own surface, and computed where that is not possible (see `upsample`).
 
     Raises:
-        InputError: a resolution scale outside (0, 1].
+        InputError: a resolution scale outside (0, 1], arrays of unequal size, a mask
+            that is not of bool, or pixels in it that `shade_points` refuses.
     """
+    mask = np.asarray(mask)
+    if mask.dtype != bool or mask.ndim != 2:
+        raise InputError(f"mask is {mask.dtype} {mask.shape}: give bool [H W]")
+    number("background", background, -LARGEST)
+    if not np.shape(position) == np.shape(normal) == (*mask.shape, 3):
+        raise InputError(
+            f"position {np.shape(position)} and normal {np.shape(normal)} do not fit "
+            f"the mask {mask.shape}: give [H W 3]"
+        )
     if not 0 < resolution_scale <= 1:
         raise InputError(f"resolution scale {resolution_scale}: give it in (0, 1]")
     channels = () if encoded.scale is None else encoded.scale.shape

@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ginn_jax.checks import LARGEST_SEED, real_array, unit_rows, whole
 from ginn_jax.errors import InputError
-from ginn_jax.lighting import EnvironmentMap, Light
-from ginn_jax.mesh import Mesh
-from ginn_jax.reference import OFFSET, check_points, columns, random_pair
+from ginn_jax.lighting import EnvironmentMap, Light, check_light
+from ginn_jax.mesh import Mesh, check_mesh
+from ginn_jax.reference import OFFSET, columns, random_pair
 from ginn_jax.renderer import use_mitsuba
 
 PATHS_PER_LAUNCH = 2**22
@@ -38,9 +39,12 @@ class ColorEstimate(NamedTuple):
 def light_scene(mesh: Mesh, albedo: Float[np.ndarray, "K 3"], light: Light) -> LitScene:
     """The scene that rays are traced in; `albedo[k]` is that of material k.
 
-    Raises `InputError` for an albedo outside [0, 1] or a material without one.
+    Raises `InputError` for an albedo outside [0, 1] or a material without one, and for
+    a mesh or a light that no renderer can take.
     """
-    albedo = np.asarray(albedo, np.float64)
+    check_mesh(mesh)
+    check_light(light)
+    albedo = real_array("albedo", albedo).astype(np.float64)
     if albedo.ndim != 2 or albedo.shape[1] != 3 or not (albedo >= 0).all():
         raise InputError(f"albedo {albedo.shape} must be [K 3] and not negative")
     if not (albedo <= 1).all():
@@ -99,7 +103,7 @@ def direct_irradiance(
     Every point looks at the light in `samples` directions, drawn in proportion to its
     radiance from a lattice that is shifted at random; one is enough for a point light.
     """
-    check_points(points, normals)
+    unit_rows(points, normals)
     check_draws("samples", samples, seed)
     samples = samples if isinstance(scene.light, EnvironmentMap) else 1
     size = max(1, min(PATHS_PER_LAUNCH // samples, len(points)))
@@ -154,7 +158,7 @@ def indirect_irradiance(
     pi times the mean of `paths` cosine-distributed path-traced radiances (paper,
     section "Training Data Generation"); Mitsuba's `path` with hidden emitters.
     """
-    check_points(points, normals)
+    unit_rows(points, normals)
     check_draws("paths", paths, seed)
     size = max(1, min(PATHS_PER_LAUNCH // paths, len(points)))
     parts = [
@@ -169,10 +173,8 @@ def indirect_irradiance(
 
 def check_draws(name: str, count: int, seed: int) -> None:
     """Raise `InputError` unless so many random draws a point can be made."""
-    if not 1 <= count <= PATHS_PER_LAUNCH:
-        raise InputError(f"{name} {count} must be from 1 to {PATHS_PER_LAUNCH}")
-    if not 0 <= seed < 2**32:
-        raise InputError(f"seed {seed} must be from 0 to 2**32 - 1")
+    whole(name, count, 1, PATHS_PER_LAUNCH)
+    whole("seed", seed, 0, LARGEST_SEED)
 
 
 def _indirect(

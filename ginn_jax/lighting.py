@@ -10,7 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ginn_jax import radiance_files
+from ginn_jax.checks import LARGEST, LARGEST_SEED, number, real_array, vector, whole
 from ginn_jax.errors import InputError
+from ginn_jax.files import check_file
 from ginn_jax.renderer import use_mitsuba
 
 ENDINGS = (".hdr", ".exr", ".pfm")
@@ -58,16 +61,17 @@ def load_environment(path: str | Path) -> EnvironmentMap:
     the file is missing or unreadable, or its radiance negative, not finite or all zero.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give an environment map")
+    check_file(path, "an environment map")
+    if not radiance_files.is_sound(path.read_bytes()):
+        raise InputError(f"{path}: cannot be read (damaged); export it anew")
     mi, variant = use_mitsuba()
     with mi.variant_context(variant):
         try:
             bitmap = mi.Bitmap(str(path))
             kind = mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32
             pixels = np.array(bitmap.convert(*kind, srgb_gamma=False))
-        except RuntimeError as error:
-            reason = str(error).strip().splitlines()[-1]
+        except Exception as error:  # its readers raise what they like
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
             raise InputError(f"{path}: cannot be read ({reason})") from None
     try:
         return make_environment(pixels)
@@ -77,12 +81,7 @@ def load_environment(path: str | Path) -> EnvironmentMap:
 
 def make_environment(radiance: Float[np.ndarray, "H W 3"]) -> EnvironmentMap:
     """A map from its pixels, checked and averaged down to 256 rows."""
-    if radiance.ndim != 3 or radiance.shape[-1] != 3 or radiance.size == 0:
-        raise InputError(f"an environment map is [H W 3], this is {radiance.shape}")
-    if not np.isfinite(radiance).all():
-        raise InputError("radiance is not finite; mend those pixels")
-    if radiance.min() < 0:
-        raise InputError("radiance is negative; clip it at zero")
+    radiance = _checked_radiance(radiance)
     if radiance.max() == 0:
         raise InputError("radiance is zero everywhere: the map is empty")
     height, width = radiance.shape[:2]
@@ -92,6 +91,31 @@ def make_environment(radiance: Float[np.ndarray, "H W 3"]) -> EnvironmentMap:
         radiance = np.einsum("iu,ujc->ijc", rows, radiance, optimize=True)
         radiance = np.einsum("jv,ivc->ijc", columns, radiance, optimize=True)
     return EnvironmentMap(radiance.astype(np.float32))
+
+
+def check_light(light: Light) -> None:
+    """Raise `InputError` unless this is a light that can be traced; it may be dark."""
+    if isinstance(light, EnvironmentMap):
+        _checked_radiance(light.radiance)
+    elif isinstance(light, PointLight):
+        vector("light's position", light.position)
+        if not (vector("light's intensity", light.intensity) >= 0).all():
+            raise InputError(f"light's intensity {light.intensity} is negative")
+    else:
+        kind = type(light).__name__
+        raise InputError(f"light is a {kind}: give an EnvironmentMap or a PointLight")
+
+
+def _checked_radiance(radiance: Float[np.ndarray, "H W 3"]) -> np.ndarray:
+    """The pixels of a map, not negative and finite in float32."""
+    radiance = real_array("radiance", radiance)
+    if radiance.ndim != 3 or radiance.shape[-1] != 3 or radiance.size == 0:
+        raise InputError(f"an environment map is [H W 3], this is {radiance.shape}")
+    if not (np.abs(radiance) <= LARGEST).all():
+        raise InputError("radiance is not finite; mend those pixels")
+    if radiance.min() < 0:
+        raise InputError("radiance is negative; clip it at zero")
+    return radiance
 
 
 def _averaging(many: int, few: int) -> Float[np.ndarray, "few many"]:
@@ -104,6 +128,7 @@ def _averaging(many: int, few: int) -> Float[np.ndarray, "few many"]:
 
 def constant_sky(radiance: float = 1.0) -> EnvironmentMap:
     """The same radiance from everywhere."""
+    number("radiance", radiance, 0.0)
     return EnvironmentMap(np.full((HEIGHT, 2 * HEIGHT, 3), radiance, np.float32))
 
 
@@ -112,9 +137,15 @@ def sun_and_sky(
 ) -> EnvironmentMap:
     """The clear sky of Hosek and Wilkie with its sun, above ground of albedo .3.
 
-    `direction` points to the sun, y up. The map is the mean of 2 x 2 directions a
-    pixel, closer than the sun is wide, so that it is never missed.
+    `direction` points to the sun, y up, which is not below the horizon; `turbidity` is
+    from 1 to 10. The map is the mean of 2 x 2 directions a pixel, closer than the sun
+    is wide, so that it is never missed.
     """
+    number("turbidity", turbidity, 1.0, 10.0)
+    number("sun_scale", sun_scale, 0.0)
+    x, y, z = vector("direction", direction)
+    if not (y >= 0 and x * x + y * y + z * z > 0):
+        raise InputError(f"direction {direction} is below the horizon or zero: lift it")
     mi, variant = use_mitsuba()
     import drjit as dr
 
@@ -142,7 +173,7 @@ def sun_and_sky(
 
 def studio(seed: int) -> EnvironmentMap:
     """A dim room with one to six soft lamps of any size, colour and place."""
-    rng = np.random.default_rng((seed, 1))
+    rng = np.random.default_rng((whole("seed", seed, 0, LARGEST_SEED), 1))
     toward = pixel_directions(HEIGHT)
     tint = rng.uniform(0.5, 1.0, (2, 3)) * rng.uniform(0.02, 0.5, (2, 1))
     height = (toward[..., 1:2] + 1) / 2
@@ -162,7 +193,7 @@ def studio(seed: int) -> EnvironmentMap:
 
 def procedural_environment(seed: int) -> EnvironmentMap:
     """An outdoor sky or a studio, another for every seed, turned at random."""
-    rng = np.random.default_rng((seed, 0))
+    rng = np.random.default_rng((whole("seed", seed, 0, LARGEST_SEED), 0))
     if rng.random() < 0.5:
         light = studio(seed)
     else:
@@ -177,7 +208,7 @@ def procedural_environment(seed: int) -> EnvironmentMap:
 
 def turned(light: EnvironmentMap, share: float) -> EnvironmentMap:
     """The map turned about the vertical by a share of a whole turn."""
-    columns = round(share * light.radiance.shape[1])
+    columns = round(number("share", share, -LARGEST) * light.radiance.shape[1])
     return EnvironmentMap(np.roll(light.radiance, columns, axis=1))
 
 

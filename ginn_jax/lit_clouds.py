@@ -10,8 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ginn_jax.dataset import ShadedPoints, load_arrays, save_arrays
-from ginn_jax.errors import InputError
+from ginn_jax.dataset import (
+    ShadedPoints,
+    another_kind,
+    check_rows,
+    load_arrays,
+    save_arrays,
+)
 
 LARGEST_HALF = 65504.0
 LIGHTS = ("irradiance", "target", "variance")
@@ -96,18 +101,23 @@ def save_lit_cloud(path: Path, cloud: LitCloud, origin: dict[str, Any]) -> None:
 
 def load_lit_cloud(path: Path, origin: dict[str, Any] | None = None) -> LitCloud:
     """Read a cloud back; raises `InputError` as `dataset.load_cloud` does."""
-    arrays = load_arrays(path, origin)
-    try:
+    with another_kind(path):
+        arrays = load_arrays(path, origin)
         for name in LIGHTS:
             unit = float(arrays.pop(f"{name}_unit"))
             arrays[name] = arrays[name].astype(np.float32) * np.float32(unit)
         arrays["normal"] = from_octahedron(arrays["normal"])
         arrays["material"] = arrays["material"].astype(np.int32)
-        return LitCloud(**arrays)
-    except (KeyError, TypeError, ValueError):
-        raise InputError(
-            f"{path} holds another kind of cloud: choose another folder"
-        ) from None
+        cloud = LitCloud(**arrays)
+        check_rows(
+            {n: a for n, a in arrays.items() if n not in ("albedo", "medium")},
+            dict.fromkeys(("position", "normal", *LIGHTS), 3),
+        )
+        check_rows({"position": cloud.albedo}, {"position": 3})
+        materials = cloud.material.max(initial=-1) + 1
+        if materials > len(cloud.albedo) or cloud.medium.shape not in ((0,), (2,)):
+            raise ValueError("material")
+    return cloud
 
 
 def to_octahedron(normal: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N 2"]:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ginn_jax.checks import positive, whole
 from ginn_jax.errors import InputError
 from ginn_jax.irradiance import (
     ColorEstimate,
@@ -46,6 +47,9 @@ class Illumination:
     looks: int = 128
     targets: int | None = None
 
+    def __post_init__(self) -> None:
+        _check_targets(self)
+
 
 @dataclass(frozen=True)
 class Scattering:
@@ -62,6 +66,16 @@ class Scattering:
     targets: int | None = None
     size: float = 100.0
     absorption: float = 0.1
+
+    def __post_init__(self) -> None:
+        _check_targets(self)
+        positive("size", self.size)
+        positive("absorption", self.absorption)
+
+
+def _check_targets(settings: Illumination | Scattering) -> None:
+    if settings.targets is not None:
+        whole("targets", settings.targets, 1, settings.points)
 
 
 class Lit(NamedTuple):

@@ -14,9 +14,19 @@ from scipy.spatial import KDTree
 from trimesh.exchange.load import mesh_formats
 
 from ginn_jax import orientation
+from ginn_jax.checks import (
+    LARGEST_INDEX,
+    positive,
+    real_array,
+    unit_rows,
+    whole,
+)
 from ginn_jax.errors import InputError, InputWarning
+from ginn_jax.mesh_files import load_scene, merge, readable
 
 GROUND_GAP = 1e-4
+# Clouds on disk number materials by a byte.
+LAST_MATERIAL = 255
 
 
 class Mesh(NamedTuple):
@@ -44,7 +54,7 @@ def make_mesh(
     face uses are dropped, and closed parts that are inside out are turned (see
     `orientation`); an `InputWarning` counts the dropped and the turned. Raises
     `InputError` for wrong shapes, an empty or all-degenerate mesh, coordinates that are
-    not finite in float32, and indices out of range.
+    not finite in float32, indices out of range, and materials outside 0..255.
     """
     vertices, faces, material = _checked_arrays(vertices, faces, material)
     corners = vertices[faces].astype(np.float64)
@@ -68,8 +78,8 @@ def load_mesh(path: str | Path) -> Mesh:
     All parts of a scene are merged into one mesh, each with its transform applied.
     Raises `InputError` where the file is missing, unreadable or has no triangles.
     """
-    scene = _load_scene(Path(path))
-    merged = scene.to_mesh()
+    scene = load_scene(Path(path))
+    merged = merge(Path(path), scene)
     if not isinstance(merged, trimesh.Trimesh) or len(merged.faces) == 0:
         if any(isinstance(g, trimesh.PointCloud) for g in scene.geometry.values()):
             raise InputError(f"{path}: a point cloud, no triangles; use load_points")
@@ -91,20 +101,22 @@ def load_points(path: str | Path) -> Samples:
     Normals are normalised. Raises `InputError` where the file is missing, unreadable,
     a mesh, without normals, or holds non-finite values or zero normals.
     """
-    clouds = list(_load_scene(Path(path)).geometry.values())
+    clouds = list(load_scene(Path(path)).geometry.values())
     if any(isinstance(cloud, trimesh.Trimesh) for cloud in clouds):
         raise InputError(f"{path}: a mesh, not a point cloud; use load_mesh")
     if len(clouds) != 1 or "_ply_raw" not in clouds[0].metadata:
         raise InputError(f"{path}: no PLY point cloud in it; save the points as PLY")
     columns = clouds[0].metadata["_ply_raw"]["vertex"]["data"]
-    position = np.asarray(clouds[0].vertices, np.float32)
+    with readable(Path(path)):
+        position = np.asarray(clouds[0].vertices, np.float32).reshape(-1, 3)
     try:
         normal = np.stack([np.ravel(columns[axis]) for axis in ("nx", "ny", "nz")], -1)
-    except (KeyError, ValueError):
+        normal = normal.astype(np.float64)
+    except (KeyError, ValueError, TypeError):
         raise InputError(
             f"{path}: the points have no normals; estimate them and save nx, ny, nz"
         ) from None
-    length = np.linalg.norm(normal.astype(np.float64), axis=1, keepdims=True)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
     usable = np.isfinite(position).all(1) & np.isfinite(length[:, 0])
     if bad := int((~usable | (length[:, 0] == 0)).sum()):
         raise InputError(
@@ -152,6 +164,7 @@ def add_ground(mesh: Mesh, half_extent: float = 0.8) -> Mesh:
 
     The square is centred at x = z = 0; `half_extent` is half its side.
     """
+    half_extent = positive("half_extent", half_extent)
     low, h = mesh.vertices[:, 1].min() - GROUND_GAP, half_extent
     square = [[-h, low, -h], [-h, low, h], [h, low, h], [h, low, -h]]
     faces = np.array([[0, 1, 2], [0, 2, 3]]) + len(mesh.vertices)
@@ -164,6 +177,9 @@ def add_ground(mesh: Mesh, half_extent: float = 0.8) -> Mesh:
 
 def sample_surface(mesh: Mesh, count: int, *, seed: int) -> Samples:
     """`count` points uniform by area, with the normals and materials of their faces."""
+    whole("count", count, 0, LARGEST_INDEX)
+    whole("seed", seed, 0, 2**63 - 1)
+    check_mesh(mesh)
     shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     position, face = trimesh.sample.sample_surface(shape, count, seed=seed)[:2]
     normal = _area_vectors(mesh.vertices[mesh.faces[face]].astype(np.float64))
@@ -181,14 +197,21 @@ def add_ground_samples(
     """The cloud and samples of a ground as in `add_ground`, as dense as the cloud.
 
     The cloud's density is 8 / (pi d^2), d the median distance to the 8th neighbour.
-    Raises `InputError` for fewer than 9 points, or where most points coincide.
+    Raises `InputError` for fewer than 9 points, or where most points coincide, or a
+    ground so large that its samples cannot be numbered.
     """
+    half_extent = positive("half_extent", half_extent)
+    whole("seed", seed, 0, 2**63 - 1)
+    unit_rows(samples.position, samples.normal)
     if len(samples.position) < 9:
         raise InputError("point cloud: fewer than 9 points; give a denser one")
     distance = KDTree(samples.position).query(samples.position, 9)[0][:, -1]
     if (spacing := float(np.median(distance))) == 0:
         raise InputError("point cloud: most points coincide; remove the duplicates")
-    count = round(8 / (np.pi * spacing**2) * (2 * half_extent) ** 2)
+    wanted = 8 / (np.pi * spacing**2) * (2 * half_extent) ** 2
+    if wanted > LARGEST_INDEX:
+        raise InputError(f"half_extent {half_extent} takes {wanted:.1g} points: lower")
+    count = round(wanted)
     place = np.random.default_rng(seed).uniform(-half_extent, half_extent, (count, 3))
     place[:, 1] = samples.position[:, 1].min()
     up = np.tile(np.array([0, 1, 0], np.float32), (count, 1))
@@ -199,11 +222,25 @@ def add_ground_samples(
     )
 
 
+def check_mesh(mesh: Mesh) -> None:
+    """Raise `InputError` unless these are triangles with an area, each of a material.
+
+    `make_mesh` makes only such; a `Mesh` put together by hand may be anything.
+    """
+    if not isinstance(mesh, Mesh):
+        kind = type(mesh).__name__
+        raise InputError(f"mesh is a {kind}: give what load_mesh or make_mesh returns")
+    vertices, faces, _ = _checked_arrays(*mesh)
+    edges = np.ptp(vertices[faces], axis=1)
+    if not edges.any():
+        raise InputError("mesh: all faces have zero area; give triangles with an area")
+
+
 def _checked_arrays(vertices, faces, material):
     """float32 vertices, int64 faces and int32 materials that belong together."""
-    vertices, faces = np.asarray(vertices), np.asarray(faces)
+    vertices, faces = real_array("vertices", vertices), real_array("faces", faces)
     if vertices.size == 0 or faces.size == 0:
-        raise InputError("mesh: empty; give at least one triangle")
+        raise InputError("mesh: empty; give vertices and faces")
     if (
         vertices.shape[1:] != (3,)
         or faces.shape[1:] != (3,)
@@ -221,24 +258,19 @@ def _checked_arrays(vertices, faces, material):
         raise InputError(
             f"mesh: a face index is outside 0..{len(vertices) - 1}; mend it"
         )
-    material = np.zeros(len(faces)) if material is None else np.asarray(material)
+    material = np.zeros(len(faces)) if material is None else material
+    material = real_array("material", material)
     if material.shape != (len(faces),):
         raise InputError(f"mesh: give one material a face, {len(faces)} in all")
+    if not ((material >= 0) & (material <= LAST_MATERIAL)).all():
+        raise InputError(f"mesh: a material is outside 0..{LAST_MATERIAL}; mend it")
     return vertices, faces, material.astype(np.int32)
 
 
-def _load_scene(path: Path) -> trimesh.Scene:
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give the path of a mesh")
-    try:
-        return trimesh.load_scene(path, process=False)
-    except Exception as error:  # trimesh lets each reader raise what it likes
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: cannot be read ({reason}); export it anew") from None
-
-
 def _into_unit_box(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-    points = points.astype(np.float64)
+    points = real_array("points", points).astype(np.float64)
+    if points.size == 0 or not np.isfinite(points).all():
+        raise InputError("object: empty or not finite; give points with an extent")
     low, high = points.min(axis=0), points.max(axis=0)
     if not (extent := (high - low).max()) > 0:
         raise InputError("object: all points coincide; give one with an extent")

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from skimage.metrics import structural_similarity
 
+from ginn_jax.checks import real_array
 from ginn_jax.errors import InputError
 
 GAMMA = 1.6
@@ -68,7 +69,7 @@ def equal_rays(error: float, per_ray_variance: float) -> float:
     `per_ray_variance` is the mean over pixels of the variance of one ray, for AO
     p(1-p): `rays * estimate.variance.mean()`. Infinite for an error of zero or less.
     """
-    if not (np.isfinite(error) and per_ray_variance >= 0):
+    if not (np.isfinite(error) and 0 <= per_ray_variance < np.inf):
         raise InputError(f"equal rays of MSE {error}, variance {per_ray_variance}")
     return float(per_ray_variance) / float(error) if error > 0 else float("inf")
 
@@ -80,7 +81,9 @@ def tone_map(image: Image, reference: Image, mask: Mask | None = None) -> Image:
     clipped, then raised to 1/1.6. Map both images of a pair with the same reference.
     A reference that is black there leaves the scale at 1.
     """
-    image, reference = np.asarray(image, float), np.asarray(reference, float)
+    image, reference = (
+        real_array("image", x).astype(np.float64) for x in (image, reference)
+    )
     colour = reference.ndim == 3 and reference.shape[-1] == 3
     luminance = _kept(reference @ LUMINANCE if colour else reference, mask)
     white = np.percentile(luminance, PERCENTILE)
@@ -119,7 +122,7 @@ def dssim(a: Image, b: Image, mask: Mask | None = None) -> float:
 
 def _pair(a: Image, b: Image) -> tuple[Image, Image]:
     """Both in float64 and of one shape."""
-    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    a, b = (real_array("an array", x).astype(np.float64) for x in (a, b))
     if a.shape != b.shape:
         raise InputError(f"shapes {a.shape} and {b.shape} differ: give two equal ones")
     return a, b
@@ -128,6 +131,7 @@ def _pair(a: Image, b: Image) -> tuple[Image, Image]:
 def _kept(values: Image, mask: Mask | None) -> Image:
     """The values where the mask, over their leading axes, is True; finite ones."""
     if mask is not None:
+        mask = np.asarray(mask)
         if mask.dtype != bool or mask.shape != values.shape[: mask.ndim]:
             raise InputError(
                 f"mask {mask.dtype}{mask.shape} does not fit {values.shape}"

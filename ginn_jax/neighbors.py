@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ginn_jax.checks import real_array
 from ginn_jax.errors import InputError
 from ginn_jax.packets import (
     PACKET,
@@ -26,6 +27,8 @@ from ginn_jax.voxels import VoxelGrid, build_grid, morton_order
 
 QUERY_BLOCK = 1 << 17
 WORD_BLOCK = 1 << 16
+# Squares of lengths from 1 / FAR to FAR are normal numbers in float32.
+FAR = 1e18
 
 
 class Pairs(NamedTuple):
@@ -48,11 +51,12 @@ def find_neighbors(
     decided in float64.
 
     Raises:
-        InputError: a shape other than [n, 3], a non-finite number, a radius <= 0.
+        InputError: a shape other than [n, 3], a non-finite number, a radius <= 0; or
+            numbers whose squares float32 does not hold.
     """
     points, queries = as_points("points", points), as_points("queries", queries)
-    if not (np.isfinite(radius) and radius > 0):
-        raise InputError(f"radius is {radius}: give a finite number above 0")
+    if np.ndim(real_array("radius", radius)) or not 1 / FAR <= radius <= FAR:
+        raise InputError(f"radius is {radius}: give a number above 0, 1e-18 to 1e18")
     if not (len(points) and len(queries)):
         return np.zeros(0, np.int32), np.zeros(0, np.int32)
     center = 0.5 * (points.min(0) + points.max(0))
@@ -81,11 +85,13 @@ def find_neighbors(
 
 def as_points(name: str, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
     """The points in float64, or `InputError` if they are not [N, 3] and finite."""
-    points = np.asarray(points, np.float64)
+    points = real_array(name, points).astype(np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"{name} has shape {points.shape}: give an array [N, 3]")
     if not np.isfinite(points).all():
         raise InputError(f"{name} holds non-finite coordinates: remove those rows")
+    if points.size and np.abs(points).max() > FAR:
+        raise InputError(f"{name} holds coordinates beyond {FAR:g}: scale them down")
     return points
 
 

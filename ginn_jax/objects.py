@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from ginn_jax.checks import LARGEST_SEED, whole
 from ginn_jax.errors import InputError, InputWarning
 from ginn_jax.lighting import (
     Light,
@@ -135,7 +136,7 @@ def pair_up(
     """Every object under `each` of the lights, in turns, so that all are used."""
     if not lights:
         raise InputError("no lights: give environment maps, or ask for procedural ones")
-    each = min(each, len(lights))
+    each = min(whole("lights for each object", each, 1, LARGEST_SEED), len(lights))
     pairs = []
     for i, source in enumerate(objects):
         for k in range(each):

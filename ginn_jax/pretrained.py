@@ -11,9 +11,17 @@ from typing import Any
 import jax
 import numpy as np
 
-from ginn_jax.checkpoint import check_names, load_weights, training_from
+from ginn_jax.checkpoint import (
+    check_names,
+    damaged,
+    limits_from,
+    load_weights,
+    read_record,
+    training_from,
+)
 from ginn_jax.dataset import load_arrays, save_arrays
 from ginn_jax.errors import InputError
+from ginn_jax.files import writing
 from ginn_jax.geometry import Limits
 from ginn_jax.network import Variables
 from ginn_jax.train import Training, state_shapes
@@ -30,12 +38,11 @@ def load_manifest(folder: Path = FOLDER) -> dict[str, Record]:
         InputError: no manifest there, or a damaged one.
     """
     path = folder / MANIFEST
-    try:
-        found = json.loads(path.read_text())
-    except FileNotFoundError:
+    if not path.exists():
         return {}
-    except (OSError, ValueError):
-        raise InputError(f"{path} is damaged: install the package again") from None
+    found = read_record(path, "no manifest: install the package again")
+    if not isinstance(found, dict):
+        raise InputError(f"{path} is damaged: install the package again")
     return found
 
 
@@ -51,13 +58,9 @@ def load_pretrained(
     if name not in manifest:
         known = ", ".join(sorted(manifest)) or "none"
         raise InputError(f"no trained network {name!r}: there are {known}")
-    try:
+    with damaged(folder / MANIFEST, "install the package again"):
         config = training_from(manifest[name]["training"])
-        limits = Limits(tuple((k, int(v)) for k, v in manifest[name]["limits"].items()))
-    except (KeyError, TypeError, ValueError, AttributeError):
-        raise InputError(
-            f"{folder / MANIFEST} is damaged at {name}: install the package again"
-        ) from None
+        limits = limits_from(manifest[name])
     check_names(folder / MANIFEST, config.network, limits)
     return config, limits, read_weights(folder / f"{name}.npz", config)
 
@@ -91,20 +94,15 @@ def export(run: Path, name: str, more: Record, folder: Path = FOLDER) -> Path:
         InputError: no finished run there.
     """
     _, limits, variables = load_weights(run)
-    try:
-        metrics = json.loads((run / "metrics.json").read_text())
-    except (OSError, ValueError):
-        raise InputError(f"{run} holds no metrics.json: let its run finish") from None
+    metrics = read_record(run / "metrics.json", "no metrics.json: let its run finish")
     folder.mkdir(parents=True, exist_ok=True)
     leaves, _ = jax.tree.flatten_with_path(variables)
     arrays = {place(keys): np.asarray(leaf) for keys, leaf in leaves}
     save_arrays(folder / f"{name}.npz", arrays, {"name": name})
     manifest = load_manifest(folder)
     manifest[name] = record_of(run, metrics, limits) | more
-    text = json.dumps(manifest, indent=1, sort_keys=True) + "\n"
-    temporary = folder / f"{MANIFEST}.partial"
-    temporary.write_text(text)
-    temporary.replace(folder / MANIFEST)
+    with writing(folder / MANIFEST) as path:
+        path.write_text(json.dumps(manifest, indent=1, sort_keys=True) + "\n")
     return folder / f"{name}.npz"
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt
 
 from ginn_jax.camera import Camera, pixel_directions
-from ginn_jax.errors import InputError
-from ginn_jax.mesh import Mesh
+from ginn_jax.checks import LARGEST_SEED, positive, unit_rows, whole
+from ginn_jax.mesh import Mesh, check_mesh
 from ginn_jax.renderer import use_mitsuba
 
 RAYS_PER_LAUNCH = 2**22
@@ -81,14 +81,9 @@ def build_scene(mesh: Mesh) -> Scene:
     Raises `InputError` for an empty or non-finite mesh, a face that names a vertex
     that is not there, or a machine without a usable libLLVM.
     """
+    check_mesh(mesh)
     vertices = np.ascontiguousarray(mesh.vertices, np.float32)
     faces = np.asarray(mesh.faces)
-    if vertices.ndim != 2 or faces.ndim != 2 or len(faces) == 0:
-        raise InputError("mesh has no faces: give at least one triangle")
-    if not np.isfinite(vertices).all():
-        raise InputError("mesh has non-finite vertices: drop or mend them")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(f"mesh faces name vertices outside 0..{len(vertices) - 1}")
     mi, variant = use_mitsuba()
     with mi.variant_context(variant):
         shape = mi.Mesh("mesh", len(vertices), len(faces))
@@ -187,25 +182,9 @@ def columns(rows: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 n"]:
     return np.ascontiguousarray(np.asarray(rows, np.float32).T)
 
 
-def check_points(points: Any, normals: Any) -> None:
-    """Raise `InputError` unless rays can start there."""
-    points, normals = np.asarray(points), np.asarray(normals)
-    if points.ndim != 2 or points.shape[1] != 3 or normals.shape != points.shape:
-        raise InputError(
-            f"points {points.shape} and normals {normals.shape} must both be [N, 3]"
-        )
-    if not np.isfinite(points).all():
-        raise InputError("points are not finite: drop those rows")
-    if not np.all(np.abs(np.einsum("ij,ij->i", normals, normals) - 1) < 2e-3):
-        raise InputError("normals are not of unit length: divide them by their length")
-
-
 def _check_rays(points: Any, normals: Any, radius: float, rays: int, seed: int) -> None:
     """Raise `InputError` unless these can be cast."""
-    check_points(points, normals)
-    if not 0 < radius < np.inf:
-        raise InputError(f"radius {radius} must be positive and finite")
-    if not 1 <= rays <= RAYS_PER_LAUNCH:
-        raise InputError(f"rays {rays} must be from 1 to {RAYS_PER_LAUNCH}")
-    if not 0 <= seed < 2**32:
-        raise InputError(f"seed {seed} must be from 0 to 2**32 - 1")
+    unit_rows(points, normals)
+    positive("radius", radius)
+    whole("rays", rays, 1, RAYS_PER_LAUNCH)
+    whole("seed", seed, 0, LARGEST_SEED)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ginn_jax.architecture import Network
+from ginn_jax.checks import unit_rows
 from ginn_jax.geometry import (
     Demands,
     Geometry,
@@ -137,7 +138,12 @@ def prepare_relighting(
     *,
     key: Key[Array, ""],
 ) -> tuple[Relightable, Limits]:
-    """A cloud and queries made ready for any light; the limits that sufficed."""
+    """A cloud and queries made ready for any light; the limits that sufficed.
+
+    Raises `InputError` for points that are not finite or normals not of unit length.
+    """
+    unit_rows(cloud.position, cloud.normal, "the cloud")
+    unit_rows(queries.position, queries.normal, "queries")
     points = _padded(cloud, slice(None), bucket(len(cloud.position)))
     while True:
         deep = without(limits, network.query.name)

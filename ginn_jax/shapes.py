@@ -12,6 +12,7 @@ import trimesh
 from ginn_jax import built_shapes as built
 from ginn_jax import curved_shapes as curved
 from ginn_jax import grown_shapes as grown
+from ginn_jax.checks import whole
 from ginn_jax.mesh import Mesh, fit_unit_box, make_mesh
 from ginn_jax.solids import join
 
@@ -68,7 +69,7 @@ _PILED = ["blob", "carving", "shell", "vase", "tower", "cloth", "bars", "vehicle
 
 def random_shape(seed: int) -> Mesh:
     """Shape number `seed` (>= 0): closed parts that face outward, unit box, +y up."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(whole("seed", seed, 0, 2**63 - 1))
     weight = np.array([family.weight for family in FAMILIES.values()])
     name = rng.choice(list(FAMILIES), p=weight / weight.sum())
     return shape_of(name, rng)

@@ -11,6 +11,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import brentq
 
+from ginn_jax.checks import number, real_array
+from ginn_jax.errors import InputError
+
 NODES = 32
 
 
@@ -30,6 +33,9 @@ def single_scattering_albedo(
         root = brentq(lambda s: slab_albedo(1 - s * s, ior) - share, 0, 1, xtol=1e-9)
         return 1 - float(np.asarray(root)) ** 2
 
+    number("index of refraction", ior, 1.0, 2.0)
+    if not np.isfinite(real_array("albedo", albedo)).all():
+        raise InputError(f"albedo {albedo} is not finite: give it in [0, 1]")
     clipped = np.clip(np.asarray(albedo, np.float64), 0, 1)
     return np.array([invert(float(a)) for a in clipped])
 

@@ -12,10 +12,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ginn_jax import irradiance
+from ginn_jax.checks import number, real_array, unit_rows
 from ginn_jax.errors import InputError
 from ginn_jax.irradiance import ColorEstimate, LitScene
 from ginn_jax.lighting import EnvironmentMap
-from ginn_jax.reference import OFFSET, check_points
+from ginn_jax.reference import OFFSET
 from ginn_jax.renderer import use_mitsuba
 from ginn_jax.slab import single_scattering_albedo
 
@@ -60,7 +61,7 @@ def subsurface_exitance(
     `points` lie on faces of material 0, whose `normals` point outward. Raises
     `InputError` on bad input.
     """
-    check_points(points, normals)
+    unit_rows(points, normals)
     _check_medium(medium, paths, seed)
     if not (scene.mesh.material == 0).any():
         raise InputError("the scene has no face of material 0 to enclose a medium")
@@ -77,13 +78,11 @@ def subsurface_exitance(
 
 def _check_medium(medium: Medium, paths: int, seed: int) -> None:
     """Raise `InputError` unless walks can be made in it."""
-    albedo = np.asarray(medium.albedo)
+    albedo = real_array("albedo", medium.albedo)
     if albedo.shape != (3,) or not ((albedo >= 0) & (albedo <= 1)).all():
         raise InputError(f"albedo {albedo} must be three numbers in [0, 1]")
-    if not 0 <= medium.extinction < np.inf:
-        raise InputError(f"extinction {medium.extinction} must be finite, not negative")
-    if not 1 <= medium.ior <= 2:
-        raise InputError(f"index of refraction {medium.ior} must be from 1 to 2")
+    number("extinction", medium.extinction, 0.0)
+    number("index of refraction", medium.ior, 1.0, 2.0)
     irradiance.check_draws("paths", paths, seed)
 
 

@@ -17,6 +17,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ginn_jax.architecture import Network
+from ginn_jax.checks import LARGEST_INDEX, LARGEST_SEED, one_of, positive, whole
 from ginn_jax.dataset import ShadedPoints
 from ginn_jax.example import Example, thin_and_search
 from ginn_jax.geometry import Demands, Limits, fits, uniform_limits
@@ -44,6 +45,15 @@ class Training:
     clip_norm: float = 1.0
     epoch_steps: int = 1
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch_size", "points", "queries", "epoch_steps"):
+            whole(name, getattr(self, name), 1, LARGEST_INDEX)
+        whole("warm_up", self.warm_up, 0, LARGEST_INDEX)
+        whole("seed", self.seed, 0, LARGEST_SEED)
+        positive("learning_rate", self.learning_rate)
+        positive("clip_norm", self.clip_norm)
+        one_of("schedule", self.schedule, ("cosine", "paper"))
 
 
 class TrainState(NamedTuple):

@@ -270,7 +270,7 @@ def test_scenes_survive_the_trip_through_a_file(tmp_path, ending):
     ("name", "content", "message"),
     [
         ("none.ply", None, "no such file"),
-        ("empty.obj", b"", "no triangles"),
+        ("empty.obj", b"", "cannot be read"),
         (
             "cut.ply",
             trimesh.creation.box().export(file_type="ply")[:300],

@@ -1,0 +1,81 @@
+"""What public functions ask of their arguments, once, at the door.
+
+Each returns what it was given, in the type to go on with, or raises `InputError`.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from ginn_jax.errors import InputError
+
+LARGEST_SEED = 2**32 - 1
+LARGEST_INDEX = 2**31 - 1
+LARGEST = float(np.finfo(np.float32).max)
+
+
+def real_array(name: str, value: Any) -> np.ndarray:
+    """An array of real numbers in its own type and shape, which need not be finite."""
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        raise InputError(f"{name} has rows of unequal length: give an array") from None
+    if not np.can_cast(array.dtype, np.float64, "same_kind"):
+        raise InputError(f"{name} holds {array.dtype}: give real numbers, as float32")
+    return array
+
+
+def whole(name: str, value: Any, least: int, most: int) -> int:
+    """A whole number from `least` to `most`."""
+    if not (isinstance(value, int | np.integer) and least <= value <= most):
+        raise InputError(
+            f"{name} {value} must be from {least} to {most}, a whole number"
+        )
+    return int(value)
+
+
+def number(name: str, value: Any, least: float, most: float = LARGEST) -> float:
+    """A number from `least` to `most`."""
+    array = real_array(name, value)
+    if array.ndim or not least <= array <= most:
+        raise InputError(f"{name} {value} must be a number from {least:g} to {most:g}")
+    return float(array)
+
+
+def positive(name: str, value: Any, most: float = LARGEST) -> float:
+    """A number above 0, at most `most`."""
+    array = real_array(name, value)
+    if array.ndim or not 0 < array <= most:
+        raise InputError(
+            f"{name} {value} must be positive and finite: give one up to {most:g}"
+        )
+    return float(array)
+
+
+def one_of(name: str, value: Any, known: tuple[str, ...]) -> None:
+    """One of the words that are known."""
+    if value not in known:
+        raise InputError(f"{name} is {value!r}: give one of {', '.join(known) or '-'}")
+
+
+def vector(name: str, value: Any) -> np.ndarray:
+    """Three finite numbers."""
+    array = real_array(name, value)
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise InputError(f"{name} {value} must be three finite numbers")
+    return array
+
+
+def unit_rows(points: Any, normals: Any, what: str = "points") -> None:
+    """Points and unit normals that belong together, all [N, 3] and finite."""
+    points, normals = real_array(what, points), real_array("normals", normals)
+    if points.ndim != 2 or points.shape[1] != 3 or normals.shape != points.shape:
+        raise InputError(
+            f"{what} {points.shape} and normals {normals.shape} must both be [N, 3]"
+        )
+    if not np.isfinite(points).all():
+        raise InputError(f"{what} holds non-finite numbers: drop those rows")
+    if not np.all(np.abs(np.einsum("ij,ij->i", normals, normals) - 1) < 2e-3):
+        raise InputError(
+            "normals are non-finite or not of unit length: divide them by their length"
+        )
