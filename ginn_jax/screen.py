@@ -79,6 +79,12 @@ def check_counts(**counts: int) -> None:
             raise InputError(f"{name} {count} must be at least 1")
 
 
+def check_pairs(directions: int) -> None:
+    """Raise `InputError` unless directions pair up to slices."""
+    if directions % 2:
+        raise InputError(f"directions {directions} must be even: a slice has two")
+
+
 def check_above_zero(**numbers: float) -> None:
     """Raise `InputError` unless every number is above 0 (it may be infinite)."""
     for name, number in numbers.items():
@@ -160,4 +166,3 @@ def gradient_noise(shape: tuple[int, int]) -> Float[np.ndarray, "H W"]:
     columns, rows = np.indices(shape)[::-1].astype(np.float64)
     inner = (0.06711056 * columns + 0.00583715 * rows) % 1
     return (52.9829189 * inner % 1).astype(np.float32)
-
