@@ -150,7 +150,7 @@ def _shifted(
     padded: Float[Array, "h w *C"],
     offset: Int[Array, "2"],
     margin: int,
-    shape: tuple[int, int],
+    shape: tuple[int, ...],
 ) -> Float[Array, "H W *C"]:
     """Each pixel's neighbour at an offset, of an image padded by a margin."""
     start = [offset[0] + margin, offset[1] + margin] + [0] * (padded.ndim - 2)

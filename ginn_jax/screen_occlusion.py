@@ -98,7 +98,7 @@ def bitmask_occlusion(
     return jnp.where(screen.mask, look_round(screen, sweep)[0], 1.0)
 
 
-def rotation_pattern(shape: tuple[int, int]) -> Float[np.ndarray, "H W"]:
+def rotation_pattern(shape: tuple[int, ...]) -> Float[np.ndarray, "H W"]:
     """Turns in [0, 1), all sixteenths once in every 4 x 4 pixels, neighbours far."""
     i, j = np.indices(shape) % PATTERN
     bayer = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])

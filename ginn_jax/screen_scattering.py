@@ -1,8 +1,8 @@
 """Subsurface scattering from what is on the screen alone: blurred irradiance.
 
 Separable as in Jimenez, Sundstedt and Gutierrez, "Screen-Space Perceptual Rendering of
-Human Skin" (2009): a diffusion profile is a sum of Gaussians, each a pass along rows and
-one along columns. The profile is normalised diffusion (Christensen and Burley,
+Human Skin" (2009): a diffusion profile is a sum of Gaussians, each a pass along rows
+and one along columns. The profile is normalised diffusion (Christensen and Burley,
 "Approximate Reflectance Profiles for Efficient Subsurface Scattering", 2015), its width
 that of a medium whose mean free path is 1 / extinction.
 """

@@ -94,16 +94,16 @@ def test_energy_stays_and_width_follows_the_mean_free_path():
 def test_a_spot_spreads_as_normalised_diffusion():
     """Energy within a distance of a small spot, against the profile's integral."""
     scene = seen.see(ABOVE, seen.FLOOR)
-    extinction = 20.0
-    light = spot(scene, 0.02)
+    extinction = 10.0
+    light = spot(scene, 0.025)
     found = scattered(scene, light, extinction, widening=1.0) / ALBEDO
     length = 1 / extinction / np.asarray(profile_shape(jnp.array(ALBEDO)))
     distance = np.hypot(scene.position[..., 0], scene.position[..., 2])
-    for radius in (0.05, 0.1, 0.2):
+    for radius in (0.1, 0.2):
         within = found[distance < radius].sum(0) / light.sum((0, 1))
         r = radius / length
         truth = 1 - np.exp(-r) / 4 - 3 / 4 * np.exp(-r / 3)
-        np.testing.assert_allclose(within, truth, atol=0.08)
+        np.testing.assert_allclose(within, truth, atol=0.05)
 
 
 def test_nothing_bleeds_over_a_gap_in_depth():
