@@ -1,7 +1,6 @@
 """Blurred irradiance: what it must keep, how wide it is, and what it misses."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import seen
@@ -13,7 +12,7 @@ from ginn_jax.errors import InputError
 from ginn_jax.irradiance import direct_irradiance, light_scene
 from ginn_jax.lighting import PointLight
 from ginn_jax.mesh import Mesh
-from ginn_jax.screen_scattering import profile_shape, radiant_exitance
+from ginn_jax.screen_scattering import radiant_exitance
 from ginn_jax.slab import external_reflectance
 from ginn_jax.subsurface import Medium, subsurface_exitance
 
@@ -97,7 +96,7 @@ def test_a_spot_spreads_as_normalised_diffusion():
     extinction = 10.0
     light = spot(scene, 0.025)
     found = scattered(scene, light, extinction, widening=1.0) / ALBEDO
-    length = 1 / extinction / np.asarray(profile_shape(jnp.array(ALBEDO)))
+    length = 1 / extinction / np.array([1.035, 1.715, 2.96])  # of these albedos
     distance = np.hypot(scene.position[..., 0], scene.position[..., 2])
     for radius in (0.1, 0.2):
         within = found[distance < radius].sum(0) / light.sum((0, 1))
@@ -129,6 +128,14 @@ def test_background_never_counts():
     ]
     poisoned = scene._replace(position=nonsense[0])
     np.testing.assert_array_equal(found, scattered(poisoned, nonsense[1]))
+
+
+def test_an_edge_before_nothing_is_not_darkened():
+    """The plate lies at depth 1, where the background is put."""
+    camera = orbit_camera(0.0, 1e-3, 1.0, width=SIZE, height=SIZE)
+    scene = seen.see(camera, ((-0.2, -0.2, -0.1), (0.2, 0.2, 0.0)))
+    found = scattered(scene, even(scene)) / (2 * ALBEDO)
+    np.testing.assert_allclose(found, scene.mask[..., None] * np.ones(3), rtol=1e-4)
 
 
 def box(low, high):
