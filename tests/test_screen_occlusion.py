@@ -22,7 +22,7 @@ def openness(method, scene, radius, **options):
 
 
 @METHODS
-@settings(max_examples=6)
+@settings(max_examples=4)
 @given(st.floats(0, 360), st.floats(10, 85), st.floats(0.02, 0.5))
 def test_a_lone_plane_is_open(method, azimuth, elevation, radius):
     camera = orbit_camera(azimuth, elevation, width=SIZE, height=SIZE)
