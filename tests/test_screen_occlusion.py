@@ -66,7 +66,7 @@ def test_background_is_open_and_does_not_count(method):
     found = openness(method, scene, 0.2)
     assert (found[~scene.mask] == 1).all()
     assert found[scene.mask].mean() > 0.99
-    assert (found[scene.mask] > 0.99).mean() > 0.95  # a few at outlines are not
+    assert (found[scene.mask] > 0.97).mean() > 0.96  # a few at outlines are not
     nonsense = np.where(scene.mask[..., None], scene.position, np.nan)
     again = method(nonsense, *scene.surface[1:], camera, 0.2)
     np.testing.assert_array_equal(found, again)
