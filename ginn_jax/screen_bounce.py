@@ -4,9 +4,10 @@ Both take what every pixel's surface sends out (exitance: albedo times irradianc
 give the indirect irradiance of one bounce, before the receiver's albedo. For another
 bounce, give the albedo times the result as exitance and add what comes.
 
-Thickness and share of the back were tuned on 5 procedural scenes (seeds 0 to 4, 256
-pixels) against the path-traced indirect irradiance of all bounces. What a back sends is
-a guess; without it the relative MSE was 1.2 instead of .8.
+Thickness and share of the back of the bitmask were tuned on procedural scenes (seeds 0
+to 4, the last choices on 0 to 3; 256 pixels) against the path-traced indirect
+irradiance of all bounces; the window took them over. What a back sends is a guess:
+without it the relative MSE of the bitmask on six other scenes was .93 instead of .64.
 """
 
 from typing import Any

@@ -85,7 +85,7 @@ def radiant_exitance(
 def profile_shape(albedo: Float[Array, "3"]) -> Float[Array, "3"]:
     """Mean free paths in the length scale of the profile, for light that comes diffuse.
 
-    Christensen and Burley 2015, equation 6.
+    Christensen and Burley 2015, their fit for diffuse surface transmission.
     """
     return 1.9 - albedo + 3.5 * (albedo - 0.8) ** 2
 

@@ -82,7 +82,7 @@ def sector(
 ) -> UInt[Array, "H W"]:
     """How many sectors lie before a point of the slice's plane, rounded.
 
-    The weight before an angle t is a closed form (Jimenez et al. 2016, equation 7).
+    The weight before an angle t is a closed form (Jimenez et al. 2016).
     """
     up, aside = view_ray(part, out)
     up, aside = part.distance + depth * up, depth * aside
