@@ -43,6 +43,12 @@ Modules, in the order the data flows; each imports only what stands before it:
     upsample          shading at a lower rate, guided by the G-buffer
     image             from a cloud and a G-buffer to an image
     relight           what does not depend on the light, kept for any light
+    screen            what methods that see only the G-buffer share: its coordinates
+    screen_slices     the directions round a pixel in planes through the eye
+    screen_sectors    what a pixel sees round itself, by slices and sectors
+    screen_occlusion  ambient occlusion from the screen alone
+    screen_bounce     one bounce of light from the screen alone
+    screen_scattering subsurface scattering from the screen alone
     metrics           errors, noise floors, equal ray counts
     evaluate          errors of ambient occlusion: points, images, against run time
     evaluate_light    the same for effects that carry light

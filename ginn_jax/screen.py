@@ -65,7 +65,7 @@ def enter_screen(
     return Screen(seen, jnp.where(inside, facing, -rays), mask, jnp.array(rays), focal)
 
 
-def check_images(shape: tuple[int, int], **images: Any) -> None:
+def check_images(shape: tuple[int, ...], **images: Any) -> None:
     """Raise `InputError` unless every image is [H W 3] of that shape."""
     for name, image in images.items():
         if jnp.shape(image) != (*shape, 3):
@@ -77,6 +77,12 @@ def check_counts(**counts: int) -> None:
     for name, count in counts.items():
         if count < 1:
             raise InputError(f"{name} {count} must be at least 1")
+
+
+def check_pairs(directions: int) -> None:
+    """Raise `InputError` unless directions pair up to slices."""
+    if directions % 2:
+        raise InputError(f"directions {directions} must be even: a slice has two")
 
 
 def check_above_zero(**numbers: float) -> None:
@@ -148,14 +154,14 @@ def look_up(
 
 
 def pixel_places(
-    shape: tuple[int, int],
+    shape: tuple[int, ...],
 ) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
     """Column and row of every pixel's centre."""
     rows, columns = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
     return columns, rows
 
 
-def gradient_noise(shape: tuple[int, int]) -> Float[np.ndarray, "H W"]:
+def gradient_noise(shape: tuple[int, ...]) -> Float[np.ndarray, "H W"]:
     """A fixed pattern in [0, 1) whose neighbours differ (Jimenez 2014)."""
     columns, rows = np.indices(shape)[::-1].astype(np.float64)
     inner = (0.06711056 * columns + 0.00583715 * rows) % 1

@@ -3,6 +3,11 @@
 Both take what every pixel's surface sends out (exitance: albedo times irradiance) and
 give the indirect irradiance of one bounce, before the receiver's albedo. For another
 bounce, give the albedo times the result as exitance and add what comes.
+
+Thickness and share of the back of the bitmask were tuned on procedural scenes (seeds 0
+to 4, the last choices on 0 to 3; 256 pixels) against the path-traced indirect
+irradiance of all bounces; the window took them over. What a back sends is a guess:
+without it the relative MSE of the bitmask on six other scenes was .93 instead of .64.
 """
 
 from typing import Any
@@ -13,18 +18,19 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ginn_jax.camera import Camera
-from ginn_jax.errors import InputError
 from ginn_jax.screen import (
     Screen,
     check_above_zero,
     check_counts,
     check_images,
+    check_pairs,
     dot,
     enter_screen,
 )
 from ginn_jax.screen_sectors import Sweep, look_round
 
 LEAST_COSINE = 0.05
+CROWDING = 2.0
 
 
 def indirect_irradiance(
@@ -36,17 +42,19 @@ def indirect_irradiance(
     *,
     window: int = 54,
     samples: int = 45,
-    back: float = 1.0,
     marches: int = 6,
     thickness: float = 0.05,
+    back: float = 1.0,
 ) -> Float[Array, "H W 3"]:
     """Irradiance from a window of `window`^2 pixels round each, as in the paper.
 
-    After Ritschel et al. 2009: every sample is a disk of its pixels' area, blocked
-    where the depth buffer lies up to `thickness` (units of length) before one of
-    `marches` points on the way. Black in the background.
+    After Ritschel et al. 2009: each of `samples`^2 places is a disk of the area that it
+    stands for (2,025 of 54^2 pixels in the paper), blocked where the depth buffer lies
+    up to `thickness` (units of length) before one of `marches` points on the way.
+    `back` is the share of its exitance that a surface is taken to send from the side
+    that is not seen. Black in the background.
     """
-    check_counts(window=window, marches=marches)
+    check_counts(window=window, samples=samples, marches=marches)
     check_above_zero(thickness=thickness)
     screen = enter_screen(position, normal, mask, camera)
     check_images(screen.mask.shape, exitance=exitance)
@@ -66,7 +74,9 @@ def indirect_irradiance(
         offset = offsets[number]
         there = _shifted(padded, offset, margin, screen.mask.shape)
         factor = form_factor(screen, there[..., 3:], share, back)
-        clear = _unblocked(screen, padded[..., 8], offset, there[..., 8], marches, thickness)
+        clear = _unblocked(
+            screen, padded[..., 8], offset, there[..., 8], marches, thickness
+        )
         return total + jnp.where(clear, factor, 0.0)[..., None] * there[..., :3]
 
     start = jnp.zeros_like(screen.position)
@@ -86,21 +96,22 @@ def bitmask_irradiance(
     steps: int = 32,
     thickness: float = 0.05,
     back: float = 1.0,
-    crowding: float = 2.0,
 ) -> Float[Array, "H W 3"]:
     """Irradiance from up to a `radius` round each pixel (Therrien et al. 2023).
 
     Each sector of a slice takes the exitance of the first pixel that covers it, so
-    that nothing shines through what is nearer and nothing counts twice. Lengths are in
-    units of length; black in the background.
+    that nothing shines through what is nearer and nothing counts twice. What is seen
+    is a slab, `thickness` deep, and sends a share `back` of its exitance from the side
+    that is not seen. Lengths are in units of length; black in the background.
     """
     check_counts(directions=directions, steps=steps)
     check_above_zero(radius=radius, thickness=thickness)
-    if directions % 2:
-        raise InputError(f"directions {directions} must be even: a slice has two")
+    check_pairs(directions)
     screen = enter_screen(position, normal, mask, camera)
     check_images(screen.mask.shape, exitance=exitance)
-    sweep = Sweep(radius, thickness, directions // 2, steps, crowding, back, joined=True)
+    sweep = Sweep(
+        radius, thickness, directions // 2, steps, CROWDING, back, joined=True
+    )
     _, arrived = look_round(screen, sweep, jnp.asarray(exitance, jnp.float32))
     return jnp.where(screen.mask[..., None], arrived, 0.0)
 
@@ -140,7 +151,7 @@ def _shifted(
     padded: Float[Array, "h w *C"],
     offset: Int[Array, "2"],
     margin: int,
-    shape: tuple[int, int],
+    shape: tuple[int, ...],
 ) -> Float[Array, "H W *C"]:
     """Each pixel's neighbour at an offset, of an image padded by a margin."""
     start = [offset[0] + margin, offset[1] + margin] + [0] * (padded.ndim - 2)

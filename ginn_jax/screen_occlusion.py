@@ -1,6 +1,8 @@
 """Ambient occlusion from what is on the screen alone: the usual way, and today's.
 
-Both take a G-buffer and give openness; both miss what the camera does not see.
+Both take a G-buffer and give openness; both miss what the camera does not see. Their
+thickness and bias were tuned on 5 procedural shapes (seeds 0 to 4, 256 pixels, radius
+.1) against ray-traced openness; infinitely thick, both are worse than a constant.
 """
 
 from typing import Any
@@ -11,11 +13,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ginn_jax.camera import Camera
-from ginn_jax.errors import InputError
 from ginn_jax.screen import (
     Screen,
     check_above_zero,
     check_counts,
+    check_pairs,
     dot,
     enter_screen,
     inverse_depths,
@@ -61,9 +63,7 @@ def ambient_occlusion(
 
         def step(k: Array, blocked: Array) -> Array:
             share = (k.astype(jnp.float32) + 0.5) / steps
-            return blocked | _hidden(
-                screen, table, start + share * ray, thickness
-            )
+            return blocked | _hidden(screen, table, start + share * ray, thickness)
 
         blocked = lax.fori_loop(0, steps, step, jnp.zeros_like(screen.mask))
         return still_open + jnp.where(blocked, 0.0, 1.0)
@@ -92,14 +92,13 @@ def bitmask_occlusion(
     """
     check_counts(directions=directions, steps=steps)
     check_above_zero(radius=radius, thickness=thickness)
-    if directions % 2:
-        raise InputError(f"directions {directions} must be even: a slice has two")
+    check_pairs(directions)
     screen = enter_screen(position, normal, mask, camera)
     sweep = Sweep(radius, thickness, directions // 2, steps, 1.0, 0.0, joined=False)
     return jnp.where(screen.mask, look_round(screen, sweep)[0], 1.0)
 
 
-def rotation_pattern(shape: tuple[int, int]) -> Float[np.ndarray, "H W"]:
+def rotation_pattern(shape: tuple[int, ...]) -> Float[np.ndarray, "H W"]:
     """Turns in [0, 1), all sixteenths once in every 4 x 4 pixels, neighbours far."""
     i, j = np.indices(shape) % PATTERN
     bayer = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])

@@ -1,8 +1,8 @@
 """Subsurface scattering from what is on the screen alone: blurred irradiance.
 
 Separable as in Jimenez, Sundstedt and Gutierrez, "Screen-Space Perceptual Rendering of
-Human Skin" (2009): a diffusion profile is a sum of Gaussians, each a pass along rows and
-one along columns. The profile is normalised diffusion (Christensen and Burley,
+Human Skin" (2009): a diffusion profile is a sum of Gaussians, each a pass along rows
+and one along columns. The profile is normalised diffusion (Christensen and Burley,
 "Approximate Reflectance Profiles for Efficient Subsurface Scattering", 2015), its width
 that of a medium whose mean free path is 1 / extinction.
 """
@@ -31,7 +31,12 @@ from ginn_jax.slab import external_reflectance
 
 # Normalised diffusion of unit shape as a sum of Gaussians, variance and weight: least
 # squares of the energy within a distance, which is met to .011.
-GAUSSIANS = ((0.00436, 0.0665), (0.16107, 0.21675), (1.92145, 0.40198), (16.98, 0.31477))
+GAUSSIANS = (
+    (0.00436, 0.0665),
+    (0.16107, 0.21675),
+    (1.92145, 0.40198),
+    (16.98, 0.31477),
+)
 REACH = 3.0
 
 
@@ -46,7 +51,7 @@ def radiant_exitance(
     extinction: float,
     ior: float,
     taps: int = 25,
-    widening: float = 1.0,
+    widening: float = 3.0,
 ) -> Float[Array, "H W 3"]:
     """What leaves a translucent object, from the irradiance on what is seen of it.
 
@@ -55,6 +60,11 @@ def radiant_exitance(
     the albedo and the share that the boundary lets in. Every pass takes `taps` samples
     up to 3 standard deviations, fewer of them where the surface breaks off. Black in
     the background.
+
+    `widening` scales all lengths: light inside is thrown back by the boundary, and the
+    profile is one for a half space lit at a point. Tuned on 5 procedural objects under
+    procedural skies (seeds 0 to 4, 192 pixels) against random walks: errors fell until
+    2 to 4.
     """
     check_counts(taps=taps)
     check_above_zero(extinction=extinction, widening=widening)
@@ -75,7 +85,7 @@ def radiant_exitance(
 def profile_shape(albedo: Float[Array, "3"]) -> Float[Array, "3"]:
     """Mean free paths in the length scale of the profile, for light that comes diffuse.
 
-    Christensen and Burley 2015, equation 6.
+    Christensen and Burley 2015, their fit for diffuse surface transmission.
     """
     return 1.9 - albedo + 3.5 * (albedo - 0.8) ** 2
 

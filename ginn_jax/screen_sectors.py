@@ -1,13 +1,10 @@
 """What a pixel sees round itself on the screen, by slices and sectors.
 
-A slice is the half plane pair through the eye and the pixel along one direction of the
-image. Its hemisphere is cut into 32 sectors of equal cosine-weighted solid angle, one
-bit each; every pixel marched over, as a slab of a given thickness, takes the sectors
-that it covers and that nothing nearer has taken. After Therrien, Levesque and Gilet,
-"Screen Space Indirect Lighting with Visibility Bitmask" (2023), in the cosine-weighted
-slices of Jimenez et al., "Practical Realtime Strategies for Accurate Indirect
-Occlusion" (2016). Other than there, a slab is cut to the sphere of the radius before
-its angles are taken, and sectors are even in weight, not in angle.
+Every pixel marched over, as a slab of a given thickness, takes the sectors of the slice
+that it covers and that nothing nearer has taken, one bit each: Therrien, Levesque and
+Gilet, "Screen Space Indirect Lighting with Visibility Bitmask" (2023). Other than
+there, a slab is cut to the sphere of the radius before its angles are taken, and
+sectors are even in cosine-weighted solid angle, not in angle.
 """
 
 import functools
@@ -27,8 +24,14 @@ from ginn_jax.screen import (
     look_up,
     pixel_places,
 )
-
-SECTORS = 32
+from ginn_jax.screen_slices import (
+    SECTORS,
+    Slice,
+    bits_below,
+    cut_slice,
+    sector,
+    view_ray,
+)
 
 
 class Sweep(NamedTuple):
@@ -50,29 +53,6 @@ class Sweep(NamedTuple):
     crowding: float
     back: float
     joined: bool
-
-
-class Slice(NamedTuple):
-    """One slice of every pixel, and its plane by two axes: to the eye, and across.
-
-    direction   unit vector on the screen, (column, row, 0)
-    along       its components to the eye and across
-    distance    of the pixel from the eye
-    length      of the ray to it, at depth 1
-    facing      cosine and sine of the normal's angle in the plane, from the eye's
-    before      share of the slice's weight that lies on the side against `direction`
-    whole       the slice's weight for a normal in its plane: |sin t| cos(t - angle)
-    weight      the same for the pixel's normal: its share of all slices
-    """
-
-    direction: Float[Array, "H W 3"]
-    along: tuple[Float[Array, "H W"], Float[Array, "H W"]]
-    distance: Float[Array, "H W"]
-    length: Float[Array, "H W"]
-    facing: tuple[Float[Array, "H W"], Float[Array, "H W"]]
-    before: Float[Array, "H W"]
-    whole: Float[Array, "H W"]
-    weight: Float[Array, "H W"]
 
 
 def look_round(
@@ -103,32 +83,6 @@ def look_round(
     still_open, arrived, whole = lax.fori_loop(0, sweep.slices, add, start)
     whole = jnp.maximum(whole, 1e-12)
     return still_open / whole, arrived / whole[..., None]
-
-
-def cut_slice(screen: Screen, angle: Float[Array, "H W"]) -> Slice:
-    """The slice of every pixel along a direction of the image."""
-    flat = jnp.zeros_like(angle)
-    direction = jnp.stack([jnp.cos(angle), jnp.sin(angle), flat], axis=-1)
-    eye = -_unit(screen.position)
-    across = _unit(direction - dot(direction, eye)[..., None] * eye)
-    up, side = dot(screen.normal, eye), dot(screen.normal, across)
-    tilt = jnp.clip(jnp.arctan2(side, up), -np.pi / 2, np.pi / 2)
-    cos, sin = jnp.cos(tilt), jnp.sin(tilt)
-    whole = cos + tilt * sin
-    return Slice(
-        direction,
-        along=(dot(direction, eye), dot(direction, across)),
-        distance=-dot(screen.position, eye),
-        length=-dot(screen.rays, eye),
-        facing=(cos, sin),
-        before=0.5 - np.pi / 4 * sin / whole,
-        whole=whole,
-        weight=jnp.hypot(up, side) * whole,
-    )
-
-
-def _unit(vector: Float[Array, "H W 3"]) -> Float[Array, "H W 3"]:
-    return vector * lax.rsqrt(jnp.maximum(dot(vector, vector), 1e-20))[..., None]
 
 
 def _senders(screen: Screen, exitance: Float[Array, "H W 3"]) -> Float[Array, "P 6"]:
@@ -201,14 +155,14 @@ def _cover(
     (out, nearness), *ends = patch if sweep.joined else patch[:1]
     first, last = _within(part, sweep, out, nearness)
     depths = [1 / jnp.maximum(w, 1e-6) for _, w in ends]
-    sectors = [_sector(part, out, z, side) for z in (first, last)]
+    sectors = [sector(part, out, z, side) for z in (first, last)]
     sectors += [
-        _sector(part, a, z, side) for (a, _), z in zip(ends, depths, strict=True)
+        sector(part, a, z, side) for (a, _), z in zip(ends, depths, strict=True)
     ]
     low = functools.reduce(jnp.minimum, sectors)
     high = functools.reduce(jnp.maximum, sectors)
     met = (nearness > 0) & (first < last)
-    return jnp.where(met, _bits_below(high) & ~_bits_below(low), jnp.uint32(0))
+    return jnp.where(met, bits_below(high) & ~bits_below(low), jnp.uint32(0))
 
 
 def _within(
@@ -222,7 +176,7 @@ def _within(
     A point at depth t lies at (distance + t up, t aside) from the pixel, in the
     slice's plane; where that is within the radius is an interval of t.
     """
-    up, aside = _view_ray(part, out)
+    up, aside = view_ray(part, out)
     square = up**2 + aside**2
     middle = -part.distance * up / square
     inside = middle**2 - (part.distance**2 - sweep.radius**2) / square
@@ -230,51 +184,6 @@ def _within(
     depth = 1 / jnp.maximum(nearness, 1e-9)
     first = jnp.maximum(depth, middle - half)
     return first, jnp.minimum(depth + sweep.thickness, middle + half)
-
-
-def _view_ray(
-    part: Slice, out: Float[Array, "H W"]
-) -> tuple[Float[Array, "H W"], Float[Array, "H W"]]:
-    """The ray from the eye that is `out` from the pixel's, by the slice's axes."""
-    return out * part.along[0] - part.length, out * part.along[1]
-
-
-def _sector(
-    part: Slice,
-    out: Float[Array, "H W"],
-    depth: Float[Array, "H W"],
-    side: Float[Array, ""],
-) -> UInt[Array, "H W"]:
-    """How many sectors lie before a point of the slice's plane, rounded.
-
-    The weight before an angle t is a closed form (Jimenez et al. 2016, equation 7).
-    """
-    up, aside = _view_ray(part, out)
-    up, aside = part.distance + depth * up, depth * aside
-    scale = lax.rsqrt(jnp.maximum(up**2 + aside**2, 1e-20))
-    c, s = up * scale, aside * scale
-    cos, sin = part.facing
-    double = (c * c - s * s) * cos + 2 * s * c * sin
-    beyond = side * (cos - double + 2 * side * _angle(c) * sin) / 4
-    before = beyond / part.whole + part.before
-    end = jnp.where(side > 0, 1.0, 0.0)
-    before = jnp.where(c * cos + s * sin > 0, before, end)
-    return jnp.round(jnp.clip(before, 0, 1) * SECTORS).astype(jnp.uint32)
-
-
-def _angle(cosine: Float[Array, "H W"]) -> Float[Array, "H W"]:
-    """Arc cosine to 7e-5 (Abramowitz and Stegun 4.4.45): most of the time is here."""
-    x = jnp.minimum(jnp.abs(cosine), 1.0)
-    smooth = 1.5707288 + x * (-0.2121144 + x * (0.0742610 - 0.0187293 * x))
-    angle = jnp.sqrt(1 - x) * smooth
-    return jnp.where(cosine < 0, np.pi - angle, angle)
-
-
-def _bits_below(count: UInt[Array, "H W"]) -> UInt[Array, "H W"]:
-    """The lowest bits, from none to all 32."""
-    all_bits = jnp.uint32(2**SECTORS - 1)
-    shifted = lax.shift_left(jnp.ones_like(count), jnp.minimum(count, 31)) - 1
-    return jnp.where(count >= SECTORS, all_bits, shifted)
 
 
 def _seen(
