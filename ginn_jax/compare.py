@@ -158,11 +158,15 @@ def screen_pictures(
         compiled = jax.jit(method).lower().compile()
         image, _, seconds = timed(compiled, repeats)
         values = np.asarray(image)[mask]
-        memory = compiled.memory_analysis()
         row = {"method": name, "seconds": seconds} | errors(shot, values, units)
-        row["memory_mib"] = (memory.temp_size_in_bytes) / 2**20
+        row["memory_mib"] = scratch_mib(compiled)
         found.append(Picture(row, values))
     return found
+
+
+def scratch_mib(compiled: Any) -> float:
+    """Memory that a compiled function asks for beside its inputs and outputs."""
+    return compiled.memory_analysis().temp_size_in_bytes / 2**20
 
 
 def screen_methods(shot: Shot, camera: Camera, settings: Settings) -> dict[str, Any]:

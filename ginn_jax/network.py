@@ -202,7 +202,9 @@ class Shader(nn.Module):
         free = Norm(config.norm, self.train)(x.free, mask)
         free = nn.Dense(config.head)(jnp.concatenate([free, seen], axis=1))
         free = Norm(config.norm, self.train)(free, mask)
-        values = 0.0 if config.linear else nn.Dense(1)(free)[:, 0]
+        values = jnp.zeros(mask.shape)
+        if not config.linear:
+            values = nn.Dense(1)(free)[:, 0]
         if x.light is None:
             return values
         beams = [x.light] if light is None else [x.light, light]
