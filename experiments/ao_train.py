@@ -181,7 +181,8 @@ def image_evaluation(
             limits_at(network, limits, radius),
             with_disk_radius(network, radius),
         )
-        for (source, cloud), view in zip(shown, views, strict=True):
+        for (source, whole), view in zip(shown, views, strict=True):
+            cloud = evaluate.split_cloud(whole, len(whole.position) * 4 // 5)[0]
             row, image, held = evaluate.network_row(variant, held, model, cloud, view)
             rows.append(row | {"name": source.name})
             if radius == own:

@@ -23,7 +23,7 @@ from ginn_jax.experiment import (
     training,
 )
 from ginn_jax.lighting import find_environments
-from ginn_jax.lit_clouds import LitCloud, network_numbers
+from ginn_jax.lit_clouds import LitCloud, network_numbers, split_points
 from ginn_jax.lit_report import write_report
 from ginn_jax.lit_scenes import Illumination, Scattering
 from ginn_jax.mesh import find_meshes
@@ -205,6 +205,7 @@ def image_evaluation(
     paths = settings.paths // 4
     for source, cloud in shown:
         view = evaluate_light.lit_view(source, settings, paths, options.resolution)
+        cloud = split_points(cloud, len(cloud.position) * 4 // 5)[0]
         given = config.network, limits, model, cloud, view
         row, values, encoded, limits = evaluate_light.lit_network_row(*given)
         units = np.asarray(encoded.scale)
