@@ -112,6 +112,11 @@ def main(options: Options) -> dict[str, Any]:
         front_rows += found[1]
         shown.append((source.name, found[2]))
         networks = found[3]
+    memory = {
+        name: compare.network_memory(trained, options.points * 4 // 5)
+        for name, trained in networks.items()
+    }
+    at_points = {n: r | {"memory_mib": memory[n]} for n, r in at_points.items()}
     metrics = summary(options, at_points, rows, front_rows, [s.name for s in sources])
     compare_report.draw_methods(options.out / "ablation.png", shown[:4])
     draw_front(options.out / "error_against_time.png", metrics["error_against_time"])
@@ -303,7 +308,7 @@ def summary(
     }
 
 
-KEPT = ("mse_3d", "relative_mse_3d", "equal_rays")
+KEPT = ("mse_3d", "relative_mse_3d", "equal_rays", "memory_mib")
 UNITS = (
     "MSE is of the transported light, in units of the squared mean light of each scene "
     "and channel."

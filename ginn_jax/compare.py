@@ -21,11 +21,22 @@ from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model, Row, View, timed
 from ginn_jax.evaluate_light import LitView
 from ginn_jax.geometry import Limits
-from ginn_jax.image import encode_cloud, shade_points, within_range
+from ginn_jax.image import (
+    BLOCK,
+    encode_cloud,
+    encode_whole,
+    only,
+    shade_block,
+    shade_points,
+    within_range,
+    without,
+)
 from ginn_jax.irradiance import ColorEstimate
 from ginn_jax.lit_clouds import LitCloud, network_numbers
 from ginn_jax.lit_scenes import Illumination, Lit, Scattering
 from ginn_jax.mesh import Mesh
+from ginn_jax.neighbors import bucket
+from ginn_jax.receptive_field import Oriented
 from ginn_jax.reference import Estimate
 from ginn_jax.scenes import Occlusion, Settings
 from ginn_jax.screen_bounce import bitmask_irradiance, indirect_irradiance
@@ -162,6 +173,35 @@ def screen_pictures(
         row["memory_mib"] = scratch_mib(compiled)
         found.append(Picture(row, values))
     return found
+
+
+def network_memory(trained: Trained, points: int) -> float:
+    """Scratch memory of f_3D on so many points and of f_2D on a block on every device.
+
+    What f_3D hands to f_2D is counted, inputs and outputs are not.
+    """
+    network, limits, model = trained
+
+    def shapes(rows: int, asked: bool) -> Any:
+        place = jax.ShapeDtypeStruct((rows, 3), np.float32)
+        ends = Oriented(place, place, jax.ShapeDtypeStruct((rows,), bool))
+        widths = (network.materials, network.lights) if asked else (0, 0)
+        numbers = (
+            jax.ShapeDtypeStruct((3, rows, width), np.float32) if width else None
+            for width in widths
+        )
+        return ends, *numbers
+
+    deep = network, without(limits, network.query.name)
+    given = model.variables, *shapes(bucket(points), True), model.key
+    compiled = encode_whole.lower(*deep, *given).compile()
+    encoded, _ = jax.eval_shape(partial(encode_whole, *deep), *given)
+    kept = sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(encoded.code))
+    flat = network, only(limits, network.query.name), model.variables
+    block = shapes(BLOCK, network.asks == "all")
+    shaded = shade_block.lower(*flat, encoded, *block).compile()
+    blocks = len(jax.devices()) * scratch_mib(shaded)
+    return max(scratch_mib(compiled), blocks) + kept / 2**20
 
 
 def scratch_mib(compiled: Any) -> float:

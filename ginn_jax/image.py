@@ -27,7 +27,7 @@ BLOCK = 1 << 14
 SLACK = 1.25
 
 
-_encode = jax.jit(encode, static_argnums=(0, 1))
+encode_whole = jax.jit(encode, static_argnums=(0, 1))
 shade_block = jax.jit(shade, static_argnums=(0, 1), compiler_options=ALONE)
 _upsample = jax.jit(upsample)
 
@@ -61,7 +61,7 @@ def encode_cloud(
     more = pad_channels(material, rows), pad_channels(light, rows)
     while True:
         deep = without(limits, network.query.name)
-        encoded, demands = _encode(network, deep, variables, cloud, *more, key)
+        encoded, demands = encode_whole(network, deep, variables, cloud, *more, key)
         short = exceeded(limits, demands)
         if not short:
             return encoded, limits
