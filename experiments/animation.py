@@ -21,7 +21,7 @@ from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
 from ginn_jax.compare import Shot, Stage, Trained
 from ginn_jax.dataset import ShadedPoints
-from ginn_jax.evaluate import Model, View
+from ginn_jax.evaluate import View
 from ginn_jax.experiment import bar
 from ginn_jax.lighting import Light, load_environment, procedural_environment
 from ginn_jax.lit_clouds import network_numbers
@@ -29,10 +29,7 @@ from ginn_jax.lit_experiment import UNSEEN_SEED
 from ginn_jax.lit_scenes import light_mesh, lit_points
 from ginn_jax.mesh import Mesh
 from ginn_jax.metrics import tone_map
-from ginn_jax.pretrained import load_manifest, load_pretrained
 from ginn_jax.scenes import Occlusion, Settings
-
-NETWORKS = {compare_report.OURS: "", "2D only": "_only_2d", "3D only": "_only_3d"}
 
 
 @dataclass(frozen=True)
@@ -77,7 +74,8 @@ def main(options: Options) -> dict[str, Any]:
     settings = compare.effect_settings(options.effect, *counts, options.radius)
     meshes = choose_frames(options, ground=options.effect != "sss")
     light = choose_light(options)
-    networks = load_networks(options)
+    key = jax.random.key(options.seed)
+    networks = compare.load_networks(options.effect, (None,) * 3, key=key)
     carried = sequences.carried_samples(meshes[0], options.points, seed=options.seed)
     frames: dict[str, list[np.ndarray]] = {}
     with bar(console) as progress:
@@ -111,17 +109,6 @@ def choose_light(options: Options) -> Light:
     if options.envmap is None:
         return procedural_environment(UNSEEN_SEED + options.seed)
     return load_environment(options.envmap)
-
-
-def load_networks(options: Options) -> dict[str, Trained]:
-    """The networks of the effect that come with the package."""
-    networks = {}
-    for name, ending in NETWORKS.items():
-        if options.effect + ending in load_manifest():
-            config, limits, weights = load_pretrained(options.effect + ending)
-            model = Model(weights, jax.random.key(options.seed))
-            networks[name] = config.network, limits, model
-    return networks
 
 
 def shade_frame(

@@ -17,10 +17,9 @@ from rich.console import Console
 
 from ginn_jax import compare, compare_report, evaluate, evaluate_light, report
 from ginn_jax.camera import orbit_camera
-from ginn_jax.checkpoint import load_weights
 from ginn_jax.commandline import require, start
 from ginn_jax.compare import Picture, Shot, Trained
-from ginn_jax.evaluate import Model, Row
+from ginn_jax.evaluate import Row
 from ginn_jax.experiment import make
 from ginn_jax.image import limits_at, with_disk_radius
 from ginn_jax.lighting import find_environments
@@ -37,10 +36,8 @@ from ginn_jax.objects import (
     procedural_lights,
     procedural_sources,
 )
-from ginn_jax.pretrained import load_pretrained
 from ginn_jax.scenes import Occlusion, Settings, cloud_origin
 
-NETWORKS = {compare_report.OURS: "", "2D only": "_only_2d", "3D only": "_only_3d"}
 TITLES = {"ao": "Ambient occlusion", "gi": "Global illumination"}
 TITLES |= {"sss": "Subsurface scattering"}
 TARGET_PATHS = 1024
@@ -99,7 +96,9 @@ def main(options: Options) -> dict[str, Any]:
     given = options.effect, options.points, targets, options.radius
     settings = compare.effect_settings(*given)
     sources = choose_sources(options)
-    networks = load_networks(options)
+    runs = options.checkpoint, options.only_2d, options.only_3d
+    key = jax.random.key(options.seed)
+    networks = compare.load_networks(options.effect, runs, key=key)
     if not isinstance(settings, Occlusion):
         settings = replace(settings, targets=options.points // 5)
     clouds = make(console, "clouds", sources, settings, options.out / "clouds")
@@ -148,20 +147,6 @@ def choose_sources(options: Options) -> list[Source]:
     )
     step = max(len(lights) // options.objects, 1)
     return pair_up(objects, lights[::step], 1)
-
-
-def load_networks(options: Options) -> dict[str, Trained]:
-    """The three networks of the effect."""
-    runs = options.checkpoint, options.only_2d, options.only_3d
-    networks: dict[str, Trained] = {}
-    for (name, ending), run in zip(NETWORKS.items(), runs, strict=True):
-        pretrained = options.effect + ending
-        config, limits, weights = (
-            load_pretrained(pretrained) if run is None else load_weights(run)
-        )
-        model = Model(weights, jax.random.key(options.seed))
-        networks[name] = config.network, limits, model
-    return networks
 
 
 def errors_at_points(
@@ -245,9 +230,9 @@ def rivals(
     units: np.ndarray | None,
 ) -> list[Row]:
     """Our network at other rates and radii, and tracing, plain and denoised."""
-    network, limits, model = networks[compare_report.OURS]
-    picture, networks[compare_report.OURS] = compare.network_picture(
-        "ours, scale 0.5", networks[compare_report.OURS], given, shot, 0.5
+    network, limits, model = networks[compare.OURS]
+    picture, networks[compare.OURS] = compare.network_picture(
+        "ours, scale 0.5", networks[compare.OURS], given, shot, 0.5
     )
     rows = [picture.row]
     for radius in options.disks:
@@ -287,7 +272,7 @@ def summary(
         known = at_points.get(row["method"], {})
         row |= {k: known[k] for k in KEPT if k in known}
     front = compare_report.pool_shots(front_rows)
-    ours = next(r for r in results if r["method"] == compare_report.OURS)
+    ours = next(r for r in results if r["method"] == compare.OURS)
     units = "" if options.effect == "ao" else UNITS
     return {
         "results": results,
@@ -318,7 +303,7 @@ UNITS = (
 def draw_front(path: Path, rows: list[Row]) -> None:
     """Error against run time, one line a kind of method."""
     groups = {
-        "ours": [r for r in rows if r["method"].startswith(compare_report.OURS)],
+        "ours": [r for r in rows if r["method"].startswith(compare.OURS)],
         "ablations": [r for r in rows if r["method"] in ("2D only", "3D only")],
         "screen space": [
             r for r in rows if r["method"] in ("screen space", "visibility bitmask")

@@ -45,8 +45,6 @@ class Options:
     """The command that trained it, for the record."""
     folder: Path = FOLDER
     """Where to."""
-    quick: bool = False
-    """Here for uniformity: there is nothing to shorten."""
 
 
 def main(options: Options) -> Path:

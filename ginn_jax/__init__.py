@@ -52,11 +52,11 @@ Modules, in the order the data flows; each imports only what stands before it:
     metrics           errors, noise floors, equal ray counts
     evaluate          errors of ambient occlusion: points, images, against run time
     evaluate_light    the same for effects that carry light
+    pretrained        the trained networks that come with the package
     compare           every method on the same pixels
     report            metrics.json, report.md and figures of an experiment
     experiment        what every experiment does around its effect
     compare_report    lost cells, Pareto front and figures of a comparison
-    pretrained        the trained networks that come with the package
     sequences         animated meshes, samples that move with them, flicker
     lit_report        report.md of effects that carry light
     lit_experiment    what the experiments of effects that carry light share

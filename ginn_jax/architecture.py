@@ -223,14 +223,26 @@ DEFAULT = compact_network()
 PRESETS = {"default": DEFAULT, "paper": PAPER, "released": RELEASED}
 PRESETS |= with_ablations(DEFAULT)
 
-# Light: the albedo of a point and what it sends out; or albedo, extinction and index
-# of refraction, and the irradiance.
 # Light goes further than occlusion, hence a level more.
-_WIDE = compact_network(k=16, levels=(0.02, 0.05, 0.1, 0.2), lights=1, local=True)
-LIT = {
-    "homogeneous": _WIDE,
-    "linear": replace(_WIDE, linear=True, local=False),
-    "released": replace(RELEASED, lights=1),
-} | with_ablations(_WIDE)
-ILLUMINATION = {name: replace(n, materials=1) for name, n in LIT.items()}
-SCATTERING = {name: replace(n, materials=3, asks="all") for name, n in LIT.items()}
+_WIDE = compact_network(k=16, levels=(0.02, 0.05, 0.1, 0.2), lights=1)
+
+
+def for_light(network: Network) -> dict[str, Network]:
+    """The presets of an effect that carries light, of which the first is its default."""
+    return {
+        "homogeneous": network,
+        "linear": replace(network, linear=True, local=False),
+        "released": replace(
+            RELEASED,
+            lights=1,
+            materials=network.materials,
+            asks=network.asks,
+        ),
+        **with_ablations(network),
+    }
+
+
+# The albedo of a point and what it sends out.
+ILLUMINATION = for_light(replace(_WIDE, materials=1))
+# Albedo, extinction and index of refraction, and the irradiance.
+SCATTERING = for_light(replace(_WIDE, materials=3, asks="all", local=True))

@@ -5,17 +5,19 @@ A shot is one scene under one camera, of ambient occlusion (`View`) or of light
 """
 
 import importlib
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float, Key
 
 from ginn_jax import evaluate, evaluate_light
 from ginn_jax.architecture import Network
 from ginn_jax.camera import Camera
+from ginn_jax.checkpoint import load_weights
 from ginn_jax.dataset import ShadedPoints, load_arrays, save_arrays
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model, Row, View, timed
@@ -36,6 +38,7 @@ from ginn_jax.lit_clouds import LitCloud, network_numbers
 from ginn_jax.lit_scenes import Illumination, Lit, Scattering
 from ginn_jax.mesh import Mesh
 from ginn_jax.neighbors import bucket
+from ginn_jax.pretrained import load_pretrained
 from ginn_jax.receptive_field import Oriented
 from ginn_jax.reference import Estimate
 from ginn_jax.scenes import Occlusion, Settings
@@ -49,12 +52,29 @@ Trained = tuple[Network, Limits, Model]
 Truth = Estimate | ColorEstimate
 Values = Float[np.ndarray, "P *C"]
 
+OURS = "ours"
+NETWORKS = {OURS: "", "2D only": "_only_2d", "3D only": "_only_3d"}
+
 
 class Picture(NamedTuple):
     """What a method made of a shot: numbers, and values of the foreground."""
 
     row: Row
     values: Values
+
+
+def load_networks(
+    effect: str, runs: Sequence[Path | None], *, key: Key[Array, ""]
+) -> dict[str, Trained]:
+    """Our network of an effect and its ablations, of finished runs or, for None, those
+    that come with the package."""
+    networks = {}
+    for (name, ending), run in zip(NETWORKS.items(), runs, strict=True):
+        config, limits, weights = (
+            load_pretrained(effect + ending) if run is None else load_weights(run)
+        )
+        networks[name] = config.network, limits, Model(weights, key)
+    return networks
 
 
 def take_shot(stage: Stage, camera: Camera, settings: Settings, *, seed: int) -> Shot:

@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from ginn_jax import report
+from ginn_jax.compare import OURS
 from ginn_jax.evaluate import Row
 from ginn_jax.metrics import tone_map
 
-OURS = "ours"
 RIVALS = ("screen space", "2D only", "3D only")
 CELLS = ("mse_3d", "mse_2d", "dssim_2d")
 

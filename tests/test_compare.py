@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from experiments import evaluate as experiment
 from ginn_jax import checkpoint, compare_report
+from ginn_jax.compare import OURS
 from ginn_jax.compare_report import (
-    OURS,
     RIVALS,
     inset_place,
     lost_cells,
