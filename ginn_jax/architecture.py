@@ -228,7 +228,7 @@ _WIDE = compact_network(k=16, levels=(0.02, 0.05, 0.1, 0.2), lights=1)
 
 
 def for_light(network: Network) -> dict[str, Network]:
-    """The presets of an effect that carries light, of which the first is its default."""
+    """The presets of an effect that carries light; the first is its default."""
     return {
         "homogeneous": network,
         "linear": replace(network, linear=True, local=False),
