@@ -127,7 +127,7 @@ def shade_frame(
     truth = compare.trace(shot, settings, options.reference, seed=options.seed)
     values = {"reference": truth.mean, "variance": truth.variance}
     for picture in compare.screen_pictures(
-        compare.with_truth(shot, truth), camera, settings, units, repeats=1
+        compare.with_truth(shot, truth), camera, settings, units
     ):
         values[picture.row["method"]] = picture.values
     for name, trained in networks.items():

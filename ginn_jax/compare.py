@@ -5,8 +5,8 @@ A shot is one scene under one camera, of ambient occlusion (`View`) or of light
 """
 
 import importlib
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -181,18 +181,57 @@ def network_values(
 
 
 def screen_pictures(
-    shot: Shot, camera: Camera, settings: Settings, units: Any, repeats: int = 3
+    shot: Shot, camera: Camera, settings: Settings, units: Any
 ) -> list[Picture]:
     """What screen-space methods make of the G-buffer."""
     mask, found = shot.gbuffer.mask, []
-    for name, method in screen_methods(shot, camera, settings).items():
-        compiled = jax.jit(method).lower().compile()
-        image, _, seconds = timed(compiled, repeats)
+    for name, (method, images, static) in screen_methods(shot, settings).items():
+        static = tuple({"camera": camera, **static}.items())
+        shapes = tuple((image.shape, image.dtype) for image in images)
+        compiled = compiled_screen(method, static, shapes)
+        image, _, seconds = timed(partial(compiled, *images), repeats=1)
         values = np.asarray(image)[mask]
         row = {"method": name, "seconds": seconds} | errors(shot, values, units)
         row["memory_mib"] = scratch_mib(compiled)
         found.append(Picture(row, values))
     return found
+
+
+@cache
+def compiled_screen(
+    method: Callable, static: tuple[tuple[str, Any], ...], shapes: tuple
+) -> Any:
+    """A screen-space method compiled for one camera and one size of images."""
+    images = [jax.ShapeDtypeStruct(*shape) for shape in shapes]
+    return jax.jit(partial(method, **dict(static))).lower(*images).compile()
+
+
+def screen_methods(
+    shot: Shot, settings: Settings
+) -> dict[str, tuple[Callable, tuple[np.ndarray, ...], dict[str, Any]]]:
+    """The screen-space methods of the effect: function, images, Python numbers."""
+    position, normal, _, mask = shot.gbuffer
+    surface = position, normal, mask
+    if isinstance(shot, View):
+        assert isinstance(settings, Occlusion)
+        static = {"radius": settings.radius}
+        return {
+            "screen space": (ambient_occlusion, surface, static),
+            "visibility bitmask": (bitmask_occlusion, surface, static),
+        }
+    pixels = shot.pixels
+    irradiance = evaluate_light.fill(mask, pixels.irradiance)
+    if isinstance(settings, Scattering):
+        extinction, ior = (float(x) for x in pixels.medium)
+        albedo = tuple(pixels.albedo[0].tolist())
+        static = {"albedo": albedo, "extinction": extinction, "ior": ior}
+        return {"screen space": (radiant_exitance, (*surface, irradiance), static)}
+    albedo = evaluate_light.fill(mask, pixels.albedo[pixels.material])
+    images = *surface, np.asarray(albedo * irradiance, np.float32)
+    return {
+        "screen space": (indirect_irradiance, images, {}),
+        "visibility bitmask": (bitmask_irradiance, images, {}),
+    }
 
 
 def network_memory(trained: Trained, points: int) -> float:
@@ -227,32 +266,6 @@ def network_memory(trained: Trained, points: int) -> float:
 def scratch_mib(compiled: Any) -> float:
     """Memory that a compiled function asks for beside its inputs and outputs."""
     return compiled.memory_analysis().temp_size_in_bytes / 2**20
-
-
-def screen_methods(shot: Shot, camera: Camera, settings: Settings) -> dict[str, Any]:
-    """The screen-space methods of the effect, by name, ready to be called."""
-    position, normal, _, mask = shot.gbuffer
-    surface = position, normal, mask
-    if isinstance(shot, View):
-        assert isinstance(settings, Occlusion)
-        radius = settings.radius
-        return {
-            "screen space": partial(ambient_occlusion, *surface, camera, radius),
-            "visibility bitmask": partial(bitmask_occlusion, *surface, camera, radius),
-        }
-    pixels = shot.pixels
-    irradiance = evaluate_light.fill(mask, pixels.irradiance)
-    if isinstance(settings, Scattering):
-        extinction, ior = (float(x) for x in pixels.medium)
-        medium = {"albedo": pixels.albedo[0], "extinction": extinction, "ior": ior}
-        given = *surface, irradiance, camera
-        return {"screen space": partial(radiant_exitance, *given, **medium)}
-    albedo = evaluate_light.fill(mask, pixels.albedo[pixels.material])
-    given = *surface, albedo * irradiance, camera
-    return {
-        "screen space": partial(indirect_irradiance, *given),
-        "visibility bitmask": partial(bitmask_irradiance, *given),
-    }
 
 
 def traced_picture(
