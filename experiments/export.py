@@ -30,7 +30,7 @@ from ginn_jax.objects import (
 from ginn_jax.pretrained import FOLDER, export
 from ginn_jax.scenes import Occlusion, occlusion_cloud
 
-FIXED_SEED, FIXED_POINTS, FIXED_COUNT = 20_000_000, 5000, 64
+FIXED_SEED, FIXED_POINTS, FIXED_COUNT = 20_000_000, 20_000, 64
 
 
 @dataclass(frozen=True)

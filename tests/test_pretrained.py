@@ -89,6 +89,7 @@ def test_every_network_of_the_manifest_loads_and_is_small():
 def test_the_error_on_the_fixed_scene_is_the_stored_one(name):
     config, limits, weights = pretrained.load_pretrained(name)
     model = Model(weights, jax.random.key(0))
-    error = fixed_scene_error(effect_of(name), config.network, limits, model)
+    with tiny.cheap_compiling():
+        error = fixed_scene_error(effect_of(name), config.network, limits, model)
     stored = MANIFEST[name]["fixed_scene_relative_mse_3d"]
     assert error == pytest.approx(stored, rel=0.05)

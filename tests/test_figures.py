@@ -1,0 +1,92 @@
+"""Scripts that draw: animation, lights never seen, latent code; tiny networks."""
+
+from dataclasses import replace
+from functools import cache
+
+import jax
+import numpy as np
+import pytest
+import tiny
+
+from experiments import animation, environment_maps, latent_features
+from ginn_jax import compare, train
+from ginn_jax.errors import InputError
+
+
+@cache
+def untrained(effect):
+    """What `load_pretrained` gives, of the tiny network before its first step."""
+    lit = replace(tiny.NETWORK, materials=1, lights=1)
+    network = tiny.NETWORK if effect == "ao" else lit
+    config = replace(tiny.CONFIG, network=network)
+    with tiny.cheap_compiling():
+        variables = jax.device_get(train.init_state(config).variables)
+    return config, tiny.LIMITS, variables
+
+
+@pytest.fixture(autouse=True)
+def tiny_networks(monkeypatch):
+    for module in (compare, environment_maps, latent_features):
+        monkeypatch.setattr(
+            module, "load_pretrained", lambda name: untrained(name.split("_")[0])
+        )
+
+
+def test_animation_tells_the_flicker_of_every_method(tmp_path):
+    options = animation.Options(
+        out=tmp_path, frames=3, resolution=40, reference=16, points=1500
+    )
+    metrics = animation.main(options)
+    rows = {row["method"]: row for row in metrics["flicker"]}
+    methods = {"screen space", "visibility bitmask", "ours", "2D only", "3D only"}
+    assert set(rows) == methods
+    assert all(np.isfinite(row["flicker"]) for row in rows.values())
+    assert rows["visibility bitmask"]["mse_2d"] < rows["ours"]["mse_2d"]
+    assert (tmp_path / "animation.gif").stat().st_size > 1000
+    assert (tmp_path / "strip.png").stat().st_size > 1000
+    text = (tmp_path / "report.md").read_text()
+    assert "procedural" in text
+    assert all(name in text for name in methods)
+
+
+def test_every_light_has_its_error_and_its_picture(tmp_path):
+    options = environment_maps.Options(
+        out=tmp_path, lights=1, point_lights=1, resolution=40, reference=8, points=1500
+    )
+    metrics = environment_maps.main(options)
+    assert [r["light"] for r in metrics["lights"]] == ["sky 10000000", "point light 0"]
+    assert all(row["relative_mse_2d"] > 0 for row in metrics["lights"])
+    assert (tmp_path / "lights.png").stat().st_size > 1000
+    assert "point light 0" in (tmp_path / "report.md").read_text()
+
+
+@pytest.mark.parametrize("effect", ["ao", "gi"])
+def test_latent_features_are_drawn(tmp_path, effect):
+    options = latent_features.Options(
+        effect, out=tmp_path, channels=2, resolution=40, points=1500
+    )
+    assert latent_features.main(options).stat().st_size > 1000
+
+
+def test_ranks_tell_every_value_from_the_others():
+    columns = np.random.default_rng(0).normal(size=(50, 3))
+    ranks = latent_features.ranked(columns)
+    assert (ranks.min(), ranks.max()) == (0, 1)
+    for column, rank in zip(columns.T, ranks.T, strict=True):
+        np.testing.assert_array_equal(column.argsort(), rank.argsort())
+
+
+def test_principal_components_find_the_plane_of_a_flat_code():
+    rng = np.random.default_rng(1)
+    flat = rng.normal(size=(80, 2)) * [5.0, 1.0] @ rng.normal(size=(2, 8))
+    ranks = latent_features.principal(flat)
+    assert ranks.shape == (80, 3)
+    first = (flat - flat.mean(0)) @ np.linalg.svd(flat - flat.mean(0))[2][0]
+    order = first.argsort()
+    assert (np.diff(ranks[order, 0]) > 0).all() or (np.diff(ranks[order, 0]) < 0).all()
+
+
+@pytest.mark.parametrize("name", ["frames", "resolution", "reference", "points"])
+def test_options_that_cannot_be_meant_are_refused(tmp_path, name):
+    with pytest.raises(InputError, match=f"--{name}"):
+        animation.main(replace(animation.Options(out=tmp_path), **{name: 1}))
