@@ -42,7 +42,7 @@ from ginn_jax.objects import (
 from ginn_jax.train import Training
 
 UNSEEN_SEED = 10_000_000
-VALIDATION_PATHS = 1024
+VALIDATION_PATHS = 512
 PATH_COUNTS = (1, 4, 16, 64)
 Preset = Literal["homogeneous", "linear", "released", "only_2d", "only_3d"]
 
