@@ -125,7 +125,7 @@ def write_report(m: dict[str, Any]) -> str:
     return f"""# The paper's tables next to ours
 
 Ours: {next(iter(m["processor"].values()))}, images of {sizes} pixels a side; the
-paper's: 1024 pixels a side on a GTX 1080. Scenes and units of the errors differ, so only
+paper's: 1024 pixels a side on a GTX 1080. Scenes and units of errors differ, so only
 ratios within a table compare ("over SS": over screen space of the same table). Reports
 of the single effects say how ours were measured.
 
