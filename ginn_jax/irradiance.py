@@ -19,9 +19,9 @@ from ginn_jax.renderer import use_mitsuba
 PATHS_PER_LAUNCH = 2**22
 # Fractional parts of multiples of these fill the square evenly (Roberts 2018, R2).
 LATTICE = (0.7548776662466927, 0.5698402909980532)
-# The integrator ends paths with a chance of at least 1 - KEEPING after EARLIEST bounces.
-# Where more light than KEEPING comes back the weight of those left would grow for ever
-# and with it the variance: there no path is ended before all but DARK is absorbed.
+# After EARLIEST bounces the integrator ends paths, each with a chance of 1 - KEEPING or
+# more. Where more light than KEEPING comes back the weight of the others would grow
+# without end, and the variance: there all but DARK has to be absorbed first.
 KEEPING, EARLIEST, LATEST, DARK = 0.95, 5, 10_000, 1e-3
 
 
