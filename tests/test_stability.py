@@ -9,7 +9,8 @@ import pytest
 import tiny
 import trimesh
 
-from ginn_jax import dataset, image, irradiance, train
+from benchmarks import stability, stability_cases, stability_stages
+from ginn_jax import dataset, hierarchy, image, irradiance, train
 from ginn_jax.dataset import unit_light
 from ginn_jax.errors import InputError
 from ginn_jax.geometry import Limits, raise_limits
@@ -154,3 +155,39 @@ def test_a_step_draws_and_searches_alike_in_float64():
     np.testing.assert_allclose(place, exact_place, atol=1e-6)
     np.testing.assert_array_equal(field.sender, exact.sender)
     np.testing.assert_allclose(field.weight, exact.weight, rtol=1e-5)
+
+
+# The benchmark
+
+
+def test_errors_are_relative_and_non_finite_numbers_are_counted():
+    found = np.array([1.0, 2.0, np.nan]), np.array([[50.0]])
+    exact = np.array([1.0, 4.0, 4.0]), np.array([[40.0]])
+    assert stability_stages.error(found, exact) == (0.5, 1)
+    assert stability_stages.error(exact, exact) == (0.0, 0)
+
+
+def test_benchmark_sees_a_lost_pair_and_a_lost_point(monkeypatch):
+    case = stability_cases.plain()._replace(count=200)
+    stages = stability_stages.search_row, stability_stages.disk_row
+    assert [stage(case)["error"] for stage in stages] == [0, 0]
+    find, thin = stability_stages.find_neighbors, hierarchy.poisson_disk
+    fewer = lambda *args: tuple(a[:-1] for a in find(*args))  # noqa: E731
+    monkeypatch.setattr(stability_stages, "find_neighbors", fewer)
+    monkeypatch.setattr(
+        hierarchy, "poisson_disk", lambda *a, key: thin(*a, key=key)[1:]
+    )
+    assert all(stage(case)["error"] > 0 for stage in stages)
+
+
+def test_report_says_what_is_outside_and_what_was_refused():
+    rows = [
+        {"stage": "f_2D", "case": "good", "error": 1e-6, "bad": 0, "ms": 1.0},
+        {"stage": "f_2D", "case": "poor", "error": 0.5, "bad": 3, "ms": 1.0},
+        {"stage": "f_2D", "case": "bent", "note": "refused: no"},
+    ]
+    parts = stability.write_report(rows).split("\n\n")
+    tables = [part for part in parts if part.startswith("| ")]
+    assert "| f_2D | 2 | 1 | 1e-06 |" in tables[0]
+    assert [case in tables[1] for case in ("good", "poor", "bent")] == [0, 1, 0]
+    assert [case in tables[2] for case in ("good", "poor", "bent")] == [0, 0, 1]
