@@ -55,6 +55,7 @@ def main(options: Options) -> dict[str, Any]:
         rows += network_rows(case)
         # Clouds to train on have the size that they have; a step need not be scaled.
         rows += [train_row(case)] if case.scale == 1 else []
+        print(f"{case.name}: {time.perf_counter() - begin:.0f} s", flush=True)
     rows += ray_rows(options.quick)
     rows += large_rows(options.points) if options.points else []
     metrics = {"rows": rows} | circumstances(options, begin)
