@@ -15,8 +15,10 @@ from ginn_jax.errors import InputError
 from ginn_jax.files import writing
 from ginn_jax.receptive_field import Oriented
 
-# Clouds of a batch stand this far apart: more than any radius and both extents.
-SPACING = 4.0
+# Clouds of a batch stand this far apart, or this many times as far as any point lies
+# from the middle of its own: more than both extents and, for all but the smallest
+# clouds, the largest radius of a preset beside.
+SPACING, APART = 4.0, 3.0
 
 
 class ShadedPoints(NamedTuple):
@@ -117,8 +119,33 @@ def load_arrays(path: Path, origin: dict[str, Any] | None) -> dict[str, np.ndarr
 
 
 def stack_clouds(clouds: Sequence[ShadedPoints]) -> ShadedPoints:
-    """A batch from clouds of equal size."""
-    return jax.tree.map(lambda *arrays: np.stack(arrays), *clouds)
+    """A batch from clouds of equal size, each counted from its own `center_of`."""
+    near = [
+        c._replace(position=relative_to(center_of(c.position), c.position))
+        for c in clouds
+    ]
+    return jax.tree.map(lambda *arrays: np.stack(arrays), *near)
+
+
+def center_of(position: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "3"]:
+    """Where to count a cloud's coordinates from: 0, unless it lies far from there.
+
+    A multiple of a power of two beyond the cloud's size, so that float32 holds it, and
+    nothing is rounded when float32 coordinates are counted from there.
+    """
+    low, high = (f(position, axis=0).astype(np.float64) for f in (np.min, np.max))
+    size = max(float((high - low).max()), float(np.finfo(np.float32).tiny))
+    unit = 2.0 ** (2 + np.ceil(np.log2(size)))
+    return (np.round((low + high) / (2 * unit)) * unit).astype(np.float32)
+
+
+def relative_to(
+    center: Float[Any, "3"] | None, position: Float[np.ndarray, "N 3"]
+) -> Float[np.ndarray, "N 3"]:
+    """Coordinates counted from there, the difference taken in float64."""
+    if center is None:
+        return np.asarray(position, np.float32)
+    return (np.asarray(position, np.float64) - np.asarray(center)).astype(np.float32)
 
 
 def unit_light(
@@ -130,18 +157,23 @@ def unit_light(
     is scaled back, is exactly homogeneous, and a sun of 1e5 looks like any other light.
     """
     count = jnp.maximum(jnp.sum(mask, dtype=jnp.float32), 1.0)
-    scale = jnp.sum(jnp.where(mask, light[:, 0], 0.0)) / count
+    scale = jnp.sum(jnp.where(mask, light[:, 0] / count, 0.0))
     return light * safe_inverse(scale), scale
 
 
 def safe_inverse(scale: Float[Array, ""]) -> Float[Array, ""]:
-    """1 / scale, or 0 for 0."""
-    return jnp.where(scale > 0, 1 / jnp.where(scale > 0, scale, 1.0), 0.0)
+    """1 / scale, or 0 for 0 and for subnormal numbers, whose inverse would be infinite.
+
+    Most devices take those for 0 as well.
+    """
+    least = float(np.finfo(np.float32).tiny)
+    normal = scale >= least
+    return jnp.where(normal, 1 / jnp.where(normal, scale, 1.0), 0.0)
 
 
 def rotate_about_up(cloud: ShadedPoints, *, key: Key[Array, ""]) -> ShadedPoints:
     """Turn positions and normals together by a random angle about the vertical axis."""
-    angle = jax.random.uniform(key, (), maxval=2 * jnp.pi)
+    angle = jax.random.uniform(key, (), jnp.float32, maxval=2 * jnp.pi)
     c, s = jnp.cos(angle), jnp.sin(angle)
     turn = jnp.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
     product = jax.lax.Precision.HIGHEST
@@ -157,7 +189,9 @@ def side_by_side(batch: ShadedPoints) -> ShadedPoints:
     Every stage is written for one cloud; this batches them all without a `vmap`, and
     one capacity serves the whole batch.
     """
-    shift = SPACING * jnp.arange(batch.position.shape[0], dtype=jnp.float32)
+    reach = APART * jnp.max(jnp.abs(batch.position))
+    spacing = jnp.maximum(SPACING, reach)
+    shift = spacing * jnp.arange(batch.position.shape[0], dtype=jnp.float32)
     position = batch.position.at[..., 0].add(shift[:, None])
     return jax.tree.map(
         lambda a: a.reshape(-1, *a.shape[2:]), batch._replace(position=position)

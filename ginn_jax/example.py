@@ -64,7 +64,7 @@ def thin_and_search(
     """Turn, thin and search a batch [B, N], of whose clouds `points` are taken."""
     clouds = batch.position.shape[0]
     turn_key, window_key, disk_key = jax.random.split(key, 3)
-    window = jax.random.randint(window_key, (), 0, batch.position.shape[1])
+    window = jax.random.randint(window_key, (), 0, batch.position.shape[1], jnp.int32)
     batch = jax.tree.map(lambda a: jnp.roll(a, -window, axis=1)[:, :points], batch)
     turn_keys = jax.random.split(turn_key, clouds)
     batch = jax.vmap(lambda c, k: rotate_about_up(c, key=k))(batch, turn_keys)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int, Key
 
 from ginn_jax.architecture import Conv, Network
+from ginn_jax.checks import LARGEST_INDEX
 from ginn_jax.errors import InputError
 from ginn_jax.hierarchy import Level, LevelLimit, build_level
 from ginn_jax.packets import Demand, EdgeLimit, Edges, radius_edges
@@ -71,8 +72,17 @@ def exceeded(limits: Limits, demands: Demands) -> dict[str, int]:
 
 
 def raise_limits(limits: Limits, demands: dict[str, int], slack: float) -> Limits:
-    """Limits that hold each of these demands and `slack` times as much."""
+    """Limits that hold each of these demands and `slack` times as much.
+
+    Raises `InputError` for more than arrays can be indexed by; demands stop there.
+    """
     sizes = dict(limits.sizes)
+    for name, need in demands.items():
+        if need * slack >= LARGEST_INDEX:
+            raise InputError(
+                f"{name} would need {need} or more: points coincide or crowd within "
+                "the radius; merge those, or choose smaller radii"
+            )
     for name, need in demands.items():
         sizes[name] = max(sizes[name], round_up(int(need * slack)))
     return Limits(tuple(sizes.items()))

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from ginn_jax.architecture import Network
 from ginn_jax.checks import LARGEST, number, real_array, unit_rows
+from ginn_jax.dataset import center_of, relative_to
 from ginn_jax.errors import InputError
 from ginn_jax.geometry import Limits, exceeded, limits_for, raise_limits
 from ginn_jax.neighbors import bucket, pad_rows
@@ -55,7 +56,8 @@ def encode_cloud(
     check_numbers("material", material, network.materials, len(position))
     check_numbers("light", light, network.lights, len(position))
     rows = bucket(len(position))
-    padded, mask = pad_rows(np.asarray(position, np.float32), rows)
+    center = center_of(position)
+    padded, mask = pad_rows(relative_to(center, position), rows)
     turned, _ = pad_rows(np.asarray(normal, np.float32), rows)
     cloud = Oriented(padded, turned, mask)
     more = pad_channels(material, rows), pad_channels(light, rows)
@@ -64,7 +66,7 @@ def encode_cloud(
         encoded, demands = encode_whole(network, deep, variables, cloud, *more, key)
         short = exceeded(limits, demands)
         if not short:
-            return encoded, limits
+            return encoded._replace(center=center), limits
         limits = raise_limits(limits, short, SLACK)
 
 
@@ -122,6 +124,7 @@ def shade_points(
     if network.asks == "all":
         check_numbers("material", material, network.materials, len(position))
         check_numbers("light", light, network.lights, len(position))
+    center, encoded = encoded.center, encoded._replace(center=None)
     copies = [jax.device_put((variables, encoded), d) for d in jax.devices()]
     size = min(BLOCK, bucket(len(position)))
     while True:
@@ -129,7 +132,7 @@ def shade_points(
         flat = only(limits, network.query.name)
         for turn, first in enumerate(range(0, len(position), size)):
             block = slice(first, first + size)
-            place, mask = pad_rows(np.asarray(position[block], np.float32), size)
+            place, mask = pad_rows(relative_to(center, position[block]), size)
             turned, _ = pad_rows(np.asarray(normal[block], np.float32), size)
             queries = Oriented(place, turned, mask)
             numbers = (

@@ -19,14 +19,22 @@ from ginn_jax.renderer import use_mitsuba
 PATHS_PER_LAUNCH = 2**22
 # Fractional parts of multiples of these fill the square evenly (Roberts 2018, R2).
 LATTICE = (0.7548776662466927, 0.5698402909980532)
+# After EARLIEST bounces the integrator ends paths, each with a chance of 1 - KEEPING or
+# more. Where more light than KEEPING comes back the weight of the others would grow
+# without end, and the variance: there all but DARK has to be absorbed first.
+KEEPING, EARLIEST, LATEST, DARK = 0.95, 5, 10_000, 1e-3
 
 
 class LitScene(NamedTuple):
-    """A mesh with materials under one light, made by `light_scene`."""
+    """A mesh with materials under one light, made by `light_scene`.
+
+    `bounces` is how many a path is certain to make where it meets something.
+    """
 
     mesh: Mesh
     light: Light
     handle: Any
+    bounces: int = EARLIEST
 
 
 class ColorEstimate(NamedTuple):
@@ -58,7 +66,15 @@ def light_scene(mesh: Mesh, albedo: Float[np.ndarray, "K 3"], light: Light) -> L
         parts: dict[str, Any] = {"type": "scene", "light": emitter(light)}
         used = np.unique(mesh.material).tolist()
         parts |= {f"material_{k}": _shape(mesh, k, albedo[k]) for k in used}
-        return LitScene(mesh, light, mi.load_dict(parts))
+        bounces = _certain_bounces(albedo[used].max(initial=0.0))
+        return LitScene(mesh, light, mi.load_dict(parts), bounces)
+
+
+def _certain_bounces(albedo: float) -> int:
+    """Bounces before a path may be ended at random, by the brightest surface."""
+    if albedo <= KEEPING:
+        return EARLIEST
+    return int(np.ceil(np.log(DARK) / np.log(min(albedo, DARK ** (1 / LATEST)))))
 
 
 def emitter(light: Light) -> dict[str, Any]:
@@ -195,7 +211,8 @@ def _indirect(
         sampler.seed(dr.opaque(mi.UInt32, int(number)), len(points) * paths)
         local = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
         cast = mi.Ray3f(at, mi.Frame3f(normal).to_world(local))
-        integrator = mi.load_dict({"type": "path", "hide_emitters": True})
+        kind = {"type": "path", "hide_emitters": True, "rr_depth": scene.bounces}
+        integrator = mi.load_dict(kind)
         radiance, _, _ = integrator.sample(scene.handle, sampler, cast)
         return summarize(np.pi * radiance, paths)
 

@@ -175,7 +175,7 @@ def packet_candidates(
 
 def count_words(near: Candidates) -> Int[Array, ""]:
     """How many lists of 32 candidates there are."""
-    return jnp.sum(-(-near.count // WORD))
+    return jnp.sum(-(-near.count // WORD), dtype=jnp.int32)
 
 
 def packet_words(
@@ -213,7 +213,8 @@ def packet_words(
             hit &= pair_filter(grid.index[row][:, None, :], own[:, :, None])
         # A sum, so that XLA does not compute a word anew for each edge that looks.
         flags = jnp.uint32(1) << bit.astype(jnp.uint32)
-        return jnp.sum(jnp.where(hit, flags, jnp.uint32(0)), axis=-1)
+        word = jnp.where(hit, flags, jnp.uint32(0))
+        return jnp.sum(word, axis=-1, dtype=jnp.uint32)
 
     word = _in_tiles(test, (chunk.owner, first, left), total)
     if number is None:

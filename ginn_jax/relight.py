@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ginn_jax.architecture import Network
 from ginn_jax.checks import unit_rows
+from ginn_jax.dataset import center_of, relative_to
 from ginn_jax.geometry import (
     Demands,
     Geometry,
@@ -144,7 +145,8 @@ def prepare_relighting(
     """
     unit_rows(cloud.position, cloud.normal, "the cloud")
     unit_rows(queries.position, queries.normal, "queries")
-    points = _padded(cloud, slice(None), bucket(len(cloud.position)))
+    center = center_of(cloud.position)
+    points = _padded(cloud, center, slice(None), bucket(len(cloud.position)))
     while True:
         deep = without(limits, network.query.name)
         scene, demands = _plan_scene(network, deep, variables, points, key)
@@ -156,7 +158,7 @@ def prepare_relighting(
         flat = only(limits, network.query.name)
         blocks, short = [], {}
         for number, first in enumerate(range(0, len(queries.position), size)):
-            block = _padded(queries, slice(first, first + size), size)
+            block = _padded(queries, center, slice(first, first + size), size)
             ends = scene.geometry, block
             plan, demands = _plan_queries(network, flat, variables, *ends)
             device = jax.devices()[number % len(jax.devices())]
@@ -168,9 +170,11 @@ def prepare_relighting(
         limits = raise_limits(limits, short, SLACK)
 
 
-def _padded(cloud: LitCloud, rows: slice, size: int) -> Oriented:
-    """Some rows of a cloud, padded to `size`."""
-    position, mask = pad_rows(np.asarray(cloud.position[rows], np.float32), size)
+def _padded(
+    cloud: LitCloud, center: Float[np.ndarray, "3"], rows: slice, size: int
+) -> Oriented:
+    """Some rows of a cloud, counted from `center`, padded to `size`."""
+    position, mask = pad_rows(relative_to(center, cloud.position[rows]), size)
     normal, _ = pad_rows(np.asarray(cloud.normal[rows], np.float32), size)
     return Oriented(position, normal, mask)
 

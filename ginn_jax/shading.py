@@ -29,7 +29,7 @@ class Encoded(NamedTuple):
     """What f_2D needs of a cloud: its finest level, searchable, with codes.
 
     Where there is light, `code` has a leading axis of channels and `scale` is the mean
-    light of each channel; else `scale` is None.
+    light of each channel; else `scale` is None. `points` are relative to `center`.
     """
 
     points: Oriented
@@ -37,6 +37,7 @@ class Encoded(NamedTuple):
     area: Array | None
     code: Code
     scale: Float[Array, "C"] | None
+    center: Float[Any, "3"] | None = None
 
 
 def encode(

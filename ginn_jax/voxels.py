@@ -37,7 +37,9 @@ class VoxelGrid(NamedTuple):
 def prefix_sum(counts: Int[Array, "K"]) -> Int[Array, "K"]:
     """Inclusive prefix sum of small non-negative counts."""
     return jax.lax.platform_dependent(
-        counts, cpu=_running_sum, default=lambda counts: jnp.cumsum(counts)
+        counts,
+        cpu=_running_sum,
+        default=lambda counts: jnp.cumsum(counts, dtype=jnp.int32),
     )
 
 
@@ -53,8 +55,9 @@ def _running_sum(counts: Int[Array, "K"]) -> Int[Array, "K"]:
 
 def saturating_sum(counts: Int[Array, "..."]) -> Int[Array, ""]:
     """Sum of counts that stops at the largest int32 instead of wrapping around."""
-    wraps = jnp.sum(counts.astype(jnp.float32)) > 2.0**31 - 1024
-    return jnp.where(wraps, jnp.int32(2**31 - 1), jnp.sum(counts))
+    wraps = jnp.sum(counts, dtype=jnp.float32) > 2.0**31 - 1024
+    total = jnp.sum(counts, dtype=jnp.int32)
+    return jnp.where(wraps, jnp.int32(2**31 - 1), total)
 
 
 def build_grid(

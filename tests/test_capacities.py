@@ -1,0 +1,183 @@
+"""Every capacity, driven to exactly what is needed and to one below.
+
+`test_packets`, `test_hierarchy` and `test_mcconv` do so by one cloud each, whose needs
+they count by hand; here clouds are drawn, and host-level calls are given too little.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tiny
+from hypothesis import Phase, given, settings
+from oracles import neighbors
+from strategies import ALL_PAIRS, POINTS, SEEDS, padded
+
+from ginn_jax import hierarchy, image, packets, train
+from ginn_jax.geometry import Limits
+from ginn_jax.receptive_field import kde_weight
+from ginn_jax.voxels import build_grid
+
+RADIUS = jnp.float32(0.297)  # no distance that clouds are drawn with
+KEY = jax.random.key(0)
+# Each example compiles anew for each capacity: few, and none to shrink a failure.
+FEW = settings(max_examples=3, phases=[Phase.reuse, Phase.generate])
+
+
+@pytest.fixture(autouse=True)
+def _cheap():
+    with tiny.cheap_compiling():
+        yield
+
+
+@partial(jax.jit, static_argnames="limit")
+def search(cloud, limit):
+    grid = build_grid(*cloud, RADIUS)
+    return packets.radius_edges(grid, *cloud, RADIUS, limit)
+
+
+@partial(jax.jit, static_argnames="limit")
+def level(cloud, seed, limit):
+    grid = build_grid(*cloud, RADIUS)
+    key = jax.random.key(seed)
+    position, mask = cloud
+    ends = position, position, mask
+    return hierarchy.build_level(grid, *ends, RADIUS, limit, key=key)
+
+
+@partial(jax.jit, static_argnames="pairs")
+def density(cloud, pairs):
+    edges = search(cloud, ALL_PAIRS)
+    position = cloud.position
+    return kde_weight(position, position, edges, RADIUS, 0.25, pairs), edges
+
+
+def room_for(demand, less=None):
+    """Capacities of exactly this, at least 1; the one called `less` is one below."""
+    wanted = {n: int(v) - (n == less) for n, v in demand._asdict().items()}
+    return packets.EdgeLimit(**{n: max(v, 1) for n, v in wanted.items()})
+
+
+def listed(edges):
+    """Pairs in the order given, without padding."""
+    real = edges.receiver < POINTS
+    return list(
+        zip(edges.receiver[real].tolist(), edges.sender[real].tolist(), strict=True)
+    )
+
+
+def check_lower(demand, need, less):
+    """Told exactly; what comes before it too, and nothing after it is told too high."""
+    assert getattr(demand, less) == getattr(need, less)
+    before = need._fields[: need._fields.index(less)]
+    assert all(getattr(demand, n) == getattr(need, n) for n in before)
+    assert all(d <= n for d, n in zip(demand, need, strict=True))
+
+
+@FEW
+@given(padded())
+def test_a_search_wants_what_it_says(cloud):
+    roomy = jax.device_get(search(cloud, ALL_PAIRS))
+    need, full = roomy.demand, listed(roomy)
+    points, rows = cloud.real()
+    true = neighbors(points, points, float(RADIUS))
+    assert need.edges == len(full) == len(true)
+    assert sorted((rows[q], rows[p]) for q, p in true) == sorted(full)
+    assert need.candidates >= len({p for _, p in true})
+    exact = jax.device_get(search(cloud, room_for(need)))
+    assert listed(exact) == full
+    assert exact.demand == need
+    for name in need._fields:
+        if getattr(need, name) > 1:
+            short = jax.device_get(search(cloud, room_for(need, name)))
+            check_lower(short.demand, need, name)
+            assert set(listed(short)) <= set(full)
+
+
+@FEW
+@given(padded(), SEEDS)
+def test_a_level_wants_what_it_says(cloud, seed):
+    build = lambda search, points: jax.device_get(  # noqa: E731
+        level(cloud, seed, hierarchy.LevelLimit(search, points))
+    )
+    roomy, need = build(ALL_PAIRS, POINTS)
+    kept = roomy.index[roomy.mask].tolist()
+    points = int(need.points)
+    assert points == len(kept)
+    exact, told = build(room_for(need.search), max(points, 1))
+    assert exact.index[exact.mask].tolist() == kept
+    assert told == need
+    for name in need.search._fields:
+        if getattr(need.search, name) > 1:
+            check_lower(
+                build(room_for(need.search, name), POINTS)[1].search, need.search, name
+            )
+    if points > 1:
+        short, told = build(ALL_PAIRS, points - 1)
+        assert told == need
+        assert short.index[short.mask].tolist() == kept[:-1]
+
+
+@FEW
+@given(padded())
+def test_a_density_wants_what_it_says(cloud):
+    (full, need), edges = jax.device_get(density(cloud, POINTS**3))
+    receivers = np.array([q for q, _ in listed(edges)], int)
+    assert need == (np.bincount(receivers) ** 2).sum()
+    if need > 1:
+        (exact, told), _ = jax.device_get(density(cloud, int(need)))
+        assert told == need
+        np.testing.assert_array_equal(exact, full)
+        assert jax.device_get(density(cloud, int(need) - 1))[0][1] == need
+
+
+# Host calls
+
+
+def one_below(demands):
+    """Capacities that each lack one."""
+    return Limits(tuple((n, max(int(d) - 1, 1)) for n, d in demands.items()))
+
+
+def counted(monkeypatch, name):
+    """What each call of a function of `image` said that it needed."""
+    calls, function = [], getattr(image, name)
+
+    def called(*args):
+        result = function(*args)
+        calls.append({n: int(d) for n, d in jax.device_get(result[1]).items()})
+        return result
+
+    monkeypatch.setattr(image, name, called)
+    return calls
+
+
+def test_host_calls_find_room_and_drop_nothing(monkeypatch):
+    """Every capacity lacks one: the result is that with room, after few attempts."""
+    network, roomy = tiny.ONE_LEVEL, tiny.ONE_LEVEL_LIMITS
+    config = train.Training(network, 1, batch_size=1, points=64, queries=32)
+    variables = train.init_state(config).variables
+    cloud = tiny.sphere_on_plane(300, 0)
+    ends = cloud.position, cloud.normal
+    deep, flat = counted(monkeypatch, "_encode"), counted(monkeypatch, "shade_block")
+
+    def run(limits):
+        encoded, found = image.encode_cloud(network, limits, variables, *ends, key=KEY)
+        values, found = image.shade_points(network, found, variables, encoded, *ends)
+        return values, found
+
+    expected, _ = run(roomy)
+    need = deep[-1] | flat[-1]
+    assert (len(deep), len(flat)) == (1, 1)
+    values, found = run(one_below(need))
+    np.testing.assert_allclose(values, expected, rtol=1e-5, atol=1e-6)
+    assert deep[-1] | flat[-1] == need
+    assert all(found.of(name) >= n for name, n in need.items())
+    # Each attempt raises a limit, at most one for each stage of a search and a level.
+    assert len(deep) - 1 <= 1 + 5
+    assert len(flat) - 1 <= 1 + 4
+    again = len(deep), len(flat)
+    run(found)
+    assert (len(deep), len(flat)) == (again[0] + 1, again[1] + 1)
