@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Int, Key
 from ginn_jax.architecture import Conv, Network
 from ginn_jax.checks import LARGEST_INDEX
 from ginn_jax.errors import InputError
-from ginn_jax.hierarchy import Level, LevelLimit, build_level
+from ginn_jax.hierarchy import Level, LevelLimit, build_level, draw_lots
 from ginn_jax.packets import Demand, EdgeLimit, Edges, radius_edges
 from ginn_jax.receptive_field import (
     Field,
@@ -184,10 +184,21 @@ def receptive_field(
 
 
 def build_geometry(
-    config: Network, limits: Limits, cloud: Oriented, *, key: Key[Array, ""]
+    config: Network,
+    limits: Limits,
+    cloud: Oriented,
+    names: Int[Array, "N"] | None = None,
+    *,
+    key: Key[Array, ""],
 ) -> tuple[Geometry, Demands]:
-    """All of f_3D's geometry; wrong where a demand exceeds its limit."""
-    levels, grids, rows, demands = _build_levels(config, limits, cloud, key)
+    """All of f_3D's geometry; wrong where a demand exceeds its limit.
+
+    `names` are the rows that the points had before they were sorted. Lots go by name,
+    so that points which move keep their turn, and levels change no more than they must.
+    """
+    if names is None:
+        names = jnp.arange(cloud.mask.shape[0], dtype=jnp.int32)
+    levels, grids, rows, demands = _build_levels(config, limits, cloud, names, key)
     finest = levels[0]
     found: dict[str, Edges] = {}
     for conv in reversed(config.encoder):
@@ -248,11 +259,15 @@ def transposed(config: Network, conv: Conv) -> str | None:
 
 
 def _build_levels(
-    config: Network, limits: Limits, cloud: Oriented, key: Key[Array, ""]
+    config: Network,
+    limits: Limits,
+    cloud: Oriented,
+    names: Int[Array, "N"],
+    key: Key[Array, ""],
 ) -> tuple[
     tuple[Oriented, ...],
     dict[int, VoxelGrid],
-    Int[Array, "N"],
+    Int[Array, "K"],
     Demands,
 ]:
     """The Poisson disk hierarchy of a cloud, and which points make its finest level."""
@@ -261,16 +276,18 @@ def _build_levels(
     demands: Demands = {}
     points = cloud
     for i, radius in enumerate(config.levels):
-        names = [f"level_{i}.{part}" for part in (*Demand._fields, "points")]
-        *searched, kept = (limits.of(name) for name in names)
+        parts = [f"level_{i}.{part}" for part in (*Demand._fields, "points")]
+        *searched, kept = (limits.of(part) for part in parts)
+        lots = draw_lots(cloud.mask.shape[0], key=jax.random.fold_in(key, i))
         level, demand = build_level(
             grid_of(config, grids, i - 1, points),
             *points,
             jnp.float32(radius),
             LevelLimit(EdgeLimit(*searched), kept),
-            key=jax.random.fold_in(key, i),
+            lots[names],
         )
-        demands |= dict(zip(names, (*demand.search, demand.points), strict=True))
+        names = names[level.index]
+        demands |= dict(zip(parts, (*demand.search, demand.points), strict=True))
         levels.append(level)
         points = Oriented(level.position, level.normal, level.mask)
     ends = tuple(Oriented(lv.position, lv.normal, lv.mask) for lv in levels)

@@ -73,15 +73,13 @@ def sample_disk(
     mask: Bool[Array, "N"],
     radius: Float[Array, ""],
     limit: EdgeLimit,
-    *,
-    key: Key[Array, ""],
+    lot: UInt32[Array, "N"],
 ) -> tuple[Bool[Array, "N"], Demand]:
-    """Maximal subset with pairwise distance >= radius, greedy in random order.
+    """Maximal subset with pairwise distance >= radius, greedy in the order of lots.
 
     The parallel Poisson disk sampling of the paper's section "3D Step". `grid` holds
     the same points. If the demand exceeds the limit the subset is not valid.
     """
-    lot = draw_lots(position.shape[0], key=key)
     edges = radius_edges(
         grid, position, mask, radius, limit, lambda s, r: beats(lot, s, r)
     )
@@ -110,11 +108,10 @@ def build_level(
     mask: Bool[Array, "N"],
     radius: Float[Array, ""],
     limit: LevelLimit,
-    *,
-    key: Key[Array, ""],
+    lot: UInt32[Array, "N"],
 ) -> tuple[Level, LevelDemand]:
     """One Poisson disk step; rows beyond the kept ones are zero and masked out."""
-    kept, search = sample_disk(grid, position, mask, radius, limit.search, key=key)
+    kept, search = sample_disk(grid, position, mask, radius, limit.search, lot)
     index, real, points = compact(kept, limit.points)
     level = Level(
         jnp.where(real[:, None], position[index], 0.0),

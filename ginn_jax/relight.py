@@ -67,7 +67,7 @@ def plan_scene(
     """All of f_3D that does not depend on the light."""
     mask = cloud.mask
     cloud, order = in_coherent_order(cloud)
-    geometry, demands = build_geometry(network, limits, cloud, key=key)
+    geometry, demands = build_geometry(network, limits, cloud, order, key=key)
     weights = variables["encoder"]["params"]
     stored = {
         name: {"kernel": stored_kernel(weights[name]["kernel"], field)}

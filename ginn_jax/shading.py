@@ -52,7 +52,7 @@ def encode(
     """f_3D with all its geometry."""
     mask = cloud.mask
     cloud, order = in_coherent_order(cloud)
-    geometry, demands = build_geometry(network, limits, cloud, key=key)
+    geometry, demands = build_geometry(network, limits, cloud, order, key=key)
     rows = order[geometry.finest]
     code, scale = encode_channels(
         network, variables, geometry, rows, mask, material, light

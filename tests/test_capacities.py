@@ -44,7 +44,9 @@ def level(cloud, seed, limit):
     key = jax.random.key(seed)
     position, mask = cloud
     ends = position, position, mask
-    return hierarchy.build_level(grid, *ends, RADIUS, limit, key=key)
+    return hierarchy.build_level(
+        grid, *ends, RADIUS, limit, hierarchy.draw_lots(len(ends[0]), key=key)
+    )
 
 
 @partial(jax.jit, static_argnames="pairs")

@@ -25,7 +25,15 @@ def build(cloud, normal, radius, seed, limit):
     grid = build_grid(*cloud, radius)
     key = jax.random.key(seed)
     position, mask = cloud
-    return hi.build_level(grid, position, normal, mask, radius, limit, key=key)
+    return hi.build_level(
+        grid,
+        position,
+        normal,
+        mask,
+        radius,
+        limit,
+        hi.draw_lots(len(position), key=key),
+    )
 
 
 def level_of(cloud, radius, seed, limit=FULL):
