@@ -163,7 +163,10 @@ def test_host_calls_find_room_and_drop_nothing(monkeypatch):
     variables = train.init_state(config).variables
     cloud = tiny.sphere_on_plane(300, 0)
     ends = cloud.position, cloud.normal
-    deep, flat = counted(monkeypatch, "encode_whole"), counted(monkeypatch, "shade_block")
+    deep, flat = (
+        counted(monkeypatch, "encode_whole"),
+        counted(monkeypatch, "shade_block"),
+    )
 
     def run(limits):
         encoded, found = image.encode_cloud(network, limits, variables, *ends, key=KEY)
