@@ -314,3 +314,28 @@ def test_only_convolutions_between_levels_are_turned():
     twins = {c.name: ge.transposed(released, c) for c in released.encoder}
     # pool_1 reaches half as far as up_1.
     assert {k: v for k, v in twins.items() if v} == {"pool_2": "up_2", "pool_3": "up_3"}
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def named_levels(config, limits, cloud, names):
+    return ge.build_geometry(config, limits, cloud, names, key=jax.random.key(2))[0]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_levels_are_of_the_same_points_however_they_are_sorted(seed):
+    """What keeps a moving cloud from flickering: lots go by name, not by place."""
+    config = NETWORKS["surface"]
+    order = np.random.default_rng(seed).permutation(len(CLOUD.mask)).astype(np.int32)
+    sorted_cloud = jax.tree.map(lambda a: a[order], CLOUD)
+    whole = generous(config)
+    one = named_levels(config, whole, CLOUD, np.arange(len(order), dtype=np.int32))
+    two = named_levels(config, whole, sorted_cloud, order)
+    other = named_levels(config, whole, sorted_cloud, np.arange(340, dtype=np.int32))
+
+    def points(geometry, level):
+        place = as_numpy(geometry.levels[level])
+        return {tuple(p) for p in place.position[place.mask].tolist()}
+
+    for level in range(len(LEVELS)):
+        assert points(one, level) == points(two, level)
+        assert points(one, level) != points(other, level)
