@@ -133,8 +133,9 @@ def _demands(
     network: Network, limits: Limits, cloud: Oriented, blocks: Oriented
 ) -> Demands:
     """What f_3D and every block of f_2D need."""
-    cloud, _ = in_coherent_order(cloud)
-    geometry, demands = build_geometry(network, limits, cloud, key=jax.random.key(0))
+    cloud, order = in_coherent_order(cloud)
+    key = jax.random.key(0)
+    geometry, demands = build_geometry(network, limits, cloud, order, key=key)
     ends = geometry.levels[0], geometry.grid, geometry.area
 
     def needs_of(block: Oriented) -> Demands:

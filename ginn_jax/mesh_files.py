@@ -35,6 +35,8 @@ def readable(path: Path) -> Iterator[None]:
         yield
     except Exception as error:  # trimesh lets each reader raise what it likes
         reason = " ".join(str(error).split())[:200] or type(error).__name__
+        if "charset_normalizer" in reason:  # with which it would guess, were it there
+            reason = "no triangles in it: neither binary nor UTF-8 text"
         raise InputError(f"{path}: cannot be read ({reason}); export it anew") from None
 
 
