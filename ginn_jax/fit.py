@@ -115,13 +115,20 @@ def fit(
             continue
         history.append(loss)
         if (step + 1) % schedule.report == 0:
-            progress(step + 1, float(np.mean(history[-schedule.report :])), "")
+            progress(step + 1, recent_loss(history, schedule.report), "")
         if (step + 1) % schedule.save == 0 or step + 1 == config.steps:
             save_losses(folder, history)
             save_run(folder, config, limits, extra or {})
             save_state(manager, state)
     finish(manager)
     return Fit(state, limits, np.array(history, np.float32), seconds, raised)
+
+
+def recent_loss(history: Sequence[float], steps: int) -> float:
+    """Mean loss of the last steps, without those that were skipped; NaN if all were."""
+    recent = np.asarray(history[-steps:])
+    kept = recent[np.isfinite(recent)]
+    return float(kept.mean()) if len(kept) else float("nan")
 
 
 def training_limits(config: Training, clouds: Sequence[Cloud]) -> Limits:

@@ -219,3 +219,9 @@ def test_part_of_a_checkpoint_is_ignored_or_named(unbroken):
 
 if __name__ == "__main__":
     main(*sys.argv[1:])
+
+
+def test_progress_leaves_skipped_steps_out():
+    nan, history = float("nan"), [9.0, 1.0, float("nan"), 3.0, float("inf")]
+    assert fit.recent_loss(history, 4) == 2.0
+    assert np.isnan(fit.recent_loss([nan, nan], 2))
