@@ -36,7 +36,7 @@ from ginn_jax.scenes import Occlusion, Settings
 class Options:
     """Shade an animation with every method."""
 
-    effect: Literal["ao", "gi", "sss"] = "ao"
+    effect: Literal["ao", "gi", "sss"] = "gi"
     """Ambient occlusion, global illumination or subsurface scattering."""
     out: Path = Path("runs/animation")
     """Folder for metrics.json, report.md, the strip and the moving image."""

@@ -47,7 +47,7 @@ TARGET_PATHS = 1024
 class Options:
     """Compare all methods of an effect on unseen scenes."""
 
-    effect: Literal["ao", "gi", "sss"] = "ao"
+    effect: Literal["ao", "gi", "sss"] = "gi"
     """Ambient occlusion, global illumination or subsurface scattering."""
     out: Path = Path("runs/evaluate")
     """Folder for references, metrics.json, report.md and figures."""

@@ -91,6 +91,7 @@ def finished_run(folder):
 def test_comparison_ends_in_a_report_and_keeps_its_references(tmp_path):
     run = finished_run(tmp_path / "run")
     options = experiment.Options(
+        "ao",
         out=tmp_path / "out",
         checkpoint=run,
         only_2d=run,

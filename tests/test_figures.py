@@ -34,7 +34,7 @@ def tiny_networks(monkeypatch):
 
 def test_animation_tells_the_flicker_of_every_method(tmp_path):
     options = animation.Options(
-        out=tmp_path, frames=3, resolution=40, reference=16, points=1500
+        "ao", out=tmp_path, frames=3, resolution=40, reference=16, points=1500
     )
     metrics = animation.main(options)
     rows = {row["method"]: row for row in metrics["flicker"]}
