@@ -24,7 +24,7 @@ from ginn_jax.dataset import ShadedPoints
 from ginn_jax.evaluate import View
 from ginn_jax.experiment import bar
 from ginn_jax.lighting import Light, load_environment, procedural_environment
-from ginn_jax.lit_clouds import network_numbers
+from ginn_jax.lit_clouds import mean_light
 from ginn_jax.lit_experiment import UNSEEN_SEED
 from ginn_jax.lit_scenes import light_mesh, lit_points
 from ginn_jax.mesh import Mesh
@@ -147,7 +147,7 @@ def stage_of(
         return points, mesh, None
     lit = light_mesh(mesh, light, settings, seed=options.seed)
     cloud = lit_points(lit, samples, options.looks, seed=options.seed)
-    return cloud, lit, network_numbers(cloud)[1][..., 0].mean(axis=1)
+    return cloud, lit, mean_light(cloud)
 
 
 def albedo_of(shot: Shot) -> np.ndarray:

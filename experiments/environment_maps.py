@@ -18,7 +18,6 @@ from rich.console import Console
 from ginn_jax import compare, evaluate_light, report
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
-from ginn_jax.evaluate import Row
 from ginn_jax.experiment import bar
 from ginn_jax.lighting import (
     Light,
@@ -26,7 +25,7 @@ from ginn_jax.lighting import (
     load_environment,
     procedural_environment,
 )
-from ginn_jax.lit_clouds import network_numbers
+from ginn_jax.lit_clouds import mean_light
 from ginn_jax.lit_experiment import UNSEEN_SEED
 from ginn_jax.lit_scenes import Scattering, light_mesh, lit_points, visible_samples
 from ginn_jax.mesh import add_ground, fit_unit_box, load_mesh
@@ -101,7 +100,8 @@ def main(options: Options) -> dict[str, Any]:
                 given = config.network, limits, weights, cloud, view.pixels
                 ready, limits = prepare_relighting(*given, key=key)
             values = relight(config.network, weights, ready, cloud, view.pixels)
-            rows.append({"light": name} | errors(cloud, view, values))
+            row = compare.errors(view, values, mean_light(cloud))
+            rows.append({"light": name} | row)
             shown = (evaluate_light.displayed(view, v) for v in (truth.mean, values))
             pictures.append((name, *shown))
             progress.advance(task)
@@ -129,13 +129,6 @@ def choose_lights(options: Options) -> dict[str, Light]:
     for seed in range(options.point_lights):
         lights[f"point light {seed}"] = random_point_light(UNSEEN_SEED + seed)
     return lights
-
-
-def errors(cloud: Any, view: evaluate_light.LitView, values: np.ndarray) -> Row:
-    """2D errors under one light."""
-    units = network_numbers(cloud)[1][..., 0].mean(axis=1)
-    row = evaluate_light.lit_image_errors(view, values, units)
-    return row | {"relative_mse_2d": row["mse_2d"] / row["variance_2d"]}
 
 
 def draw(path: Path, pictures: list[tuple[str, np.ndarray, np.ndarray]]) -> None:

@@ -23,7 +23,7 @@ from ginn_jax.evaluate import Row
 from ginn_jax.experiment import make
 from ginn_jax.image import limits_at, with_disk_radius
 from ginn_jax.lighting import find_environments
-from ginn_jax.lit_clouds import LitCloud, network_numbers, split_points
+from ginn_jax.lit_clouds import LitCloud, mean_light, split_points
 from ginn_jax.lit_experiment import UNSEEN_SEED
 from ginn_jax.lit_scenes import light_up
 from ginn_jax.mesh import find_meshes
@@ -218,7 +218,7 @@ def points_given(cloud: Any) -> tuple[Any, np.ndarray | None]:
     if not isinstance(cloud, LitCloud):
         return evaluate.split_cloud(cloud, count)[0], None
     given = split_points(cloud, count)[0]
-    return given, network_numbers(given)[1][..., 0].mean(axis=1)
+    return given, mean_light(given)
 
 
 def rivals(

@@ -127,13 +127,20 @@ def target_of(shot: Shot) -> Values:
 def errors(shot: Shot, values: Values, units: Float[np.ndarray, "C"] | None) -> Row:
     """2D errors of a picture; `units` are those of the light, see `evaluate_light`."""
     if isinstance(shot, View):
-        mask, noise = shot.gbuffer.mask, float(np.mean(shot.variance))
-        row = evaluate.image_errors(shot, evaluate.fill(mask, values))
-        row["variance_2d"] = float(np.var(shot.reference[mask])) - noise
+        row = evaluate.image_errors(shot, evaluate.fill(shot.gbuffer.mask, values))
     else:
         assert units is not None
         row = evaluate_light.lit_image_errors(shot, values, units)
-    return row | {"relative_mse_2d": row["mse_2d"] / row["variance_2d"]}
+    return row | relative_error(shot, row)
+
+
+def relative_error(shot: Shot, row: Row) -> Row:
+    """The error of a row over the variance of the reference, and that variance."""
+    variance = row.get("variance_2d")
+    if isinstance(shot, View):
+        noise = float(np.mean(shot.variance))
+        variance = float(np.var(target_of(shot))) - noise
+    return {"variance_2d": variance, "relative_mse_2d": row["mse_2d"] / variance}
 
 
 def network_picture(
@@ -148,11 +155,10 @@ def network_picture(
     given = network, limits, model, cloud, shot, scale
     if isinstance(shot, View):
         row, image, limits = evaluate.network_row(*given)  # type: ignore[arg-type]
-        values, units = image[shot.gbuffer.mask], None
+        values = image[shot.gbuffer.mask]
     else:
-        row, values, encoded, limits = evaluate_light.lit_network_row(*given)  # type: ignore[arg-type]
-        units = np.asarray(encoded.scale)
-    row |= {"method": name} | errors(shot, values, units)
+        row, values, _, limits = evaluate_light.lit_network_row(*given)  # type: ignore[arg-type]
+    row |= {"method": name} | relative_error(shot, row)
     return Picture(row, values), (network, limits, model)
 
 

@@ -77,6 +77,11 @@ def network_numbers(
     return np.concatenate([albedo, rest], axis=2), irradiance
 
 
+def mean_light(cloud: LitCloud) -> Float[np.ndarray, "3"]:
+    """Mean of the light that the network takes, the unit of each channel."""
+    return network_numbers(cloud)[1][..., 0].mean(axis=1)
+
+
 def split_points(cloud: LitCloud, count: int) -> tuple[LitCloud, LitCloud]:
     """The first `count` points, and the others."""
     whole = {"albedo": cloud.albedo, "medium": cloud.medium}

@@ -23,7 +23,7 @@ from ginn_jax.experiment import (
     training,
 )
 from ginn_jax.lighting import find_environments
-from ginn_jax.lit_clouds import LitCloud, network_numbers, split_points
+from ginn_jax.lit_clouds import LitCloud, mean_light, split_points
 from ginn_jax.lit_report import write_report
 from ginn_jax.lit_scenes import Illumination, Scattering
 from ginn_jax.mesh import find_meshes
@@ -162,7 +162,7 @@ def unit_floor(clouds: Sequence[LitCloud]) -> float:
     """Mean noise of the targets in the unit of the training loss."""
     floors = []
     for cloud in clouds:
-        scale = network_numbers(cloud)[1][..., 0].mean(axis=1)
+        scale = mean_light(cloud)
         lit = scale > 0
         floors += (cloud.variance.mean(axis=0)[lit] / scale[lit] ** 2).tolist()
     return float(np.mean(floors))

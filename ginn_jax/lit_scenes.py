@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ginn_jax.checks import positive, whole
 from ginn_jax.errors import InputError
@@ -179,16 +179,15 @@ def visible_samples(scene: Scene, count: int, seed: int) -> Samples:
     drawn = count
     for _ in range(5):
         samples = sample_surface(scene.mesh, drawn, seed=seed)
-        sky = ambient_occlusion(
-            scene,
-            samples.position,
-            samples.normal,
-            FAR,
-            rays=PROBE_RAYS,
-            seed=seed,
-        )
-        seen = np.flatnonzero(sky.mean > 0)
+        seen = reached_by_light(scene, samples, seed)
         if len(seen) >= count:
             return Samples(*(a[seen[:count]] for a in samples))
         drawn = 2 * drawn
     raise InputError("nearly all of the mesh's surface is sealed inside it: mend it")
+
+
+def reached_by_light(scene: Scene, samples: Samples, seed: int) -> Int[np.ndarray, "K"]:
+    """The samples from which at least one of `PROBE_RAYS` rays leaves the scene."""
+    ends = samples.position, samples.normal
+    sky = ambient_occlusion(scene, *ends, FAR, rays=PROBE_RAYS, seed=seed)
+    return np.flatnonzero(sky.mean > 0)

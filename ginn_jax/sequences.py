@@ -13,9 +13,9 @@ import trimesh
 from jaxtyping import Float, Int
 
 from ginn_jax.errors import InputError
-from ginn_jax.lit_scenes import FAR, PROBE_RAYS
+from ginn_jax.lit_scenes import reached_by_light
 from ginn_jax.mesh import Mesh, Samples, add_ground, fit_unit_box
-from ginn_jax.reference import ambient_occlusion, build_scene
+from ginn_jax.reference import build_scene
 from ginn_jax.shapes import random_shape
 
 
@@ -103,9 +103,7 @@ def carried_samples(mesh: Mesh, count: int, *, seed: int) -> Carried:
     barycentric = trimesh.triangles.points_to_barycentric(corners, place)
     carried = Carried(face.astype(np.int32), barycentric.astype(np.float32))
     samples = samples_at(mesh, carried)
-    ends = samples.position, samples.normal
-    sky = ambient_occlusion(build_scene(mesh), *ends, FAR, rays=PROBE_RAYS, seed=seed)
-    seen = np.flatnonzero(sky.mean > 0)[:count]
+    seen = reached_by_light(build_scene(mesh), samples, seed)[:count]
     if len(seen) < count:
         raise InputError("more than half of the surface is sealed inside: mend it")
     return Carried(*(a[seen] for a in carried))
