@@ -26,6 +26,7 @@ from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
 from ginn_jax.geometry import Limits, uniform_limits
 from ginn_jax.mesh import find_meshes
+from ginn_jax.neighbors import bucket
 from ginn_jax.network import Variables
 from ginn_jax.receptive_field import Oriented
 from ginn_jax.reference import GBuffer, Scene
@@ -112,11 +113,11 @@ def compare(
     cloud = lit_scenes.visible_samples(scene, options.points, seed=0)
     key = jax.random.key(0)
     limits = uniform_limits(network, 1 << 17)
-    encoded, limits = image.encode_cloud(
-        network, limits, variables, cloud.position, cloud.normal, key=key
-    )
-    flat = tuple((n, 4096) for n, _ in limits.sizes if n.startswith("query."))
-    limits = Limits((*(s for s in limits.sizes if s[0] not in dict(flat)), *flat))
+    encode = partial(image.encode_cloud, network)
+    arrays = variables, cloud.position, cloud.normal
+    encoded, limits = encode(limits, *arrays, key=key)
+    limits = tight_limits(limits, int(np.sum(encoded.points.mask)))
+    encoded, limits = encode(limits, *arrays, key=key)
     pixels = gbuffer.position, gbuffer.normal, gbuffer.mask
     _, limits = image.shade_image(network, limits, variables, encoded, *pixels)
 
@@ -155,6 +156,12 @@ def compare(
     }
 
 
+def tight_limits(limits: Limits, points: int) -> Limits:
+    """Room for so many points, and for a block of queries what it turns out to need."""
+    sizes = {n: 512 if n.startswith("query.") else size for n, size in limits.sizes}
+    return Limits(tuple((sizes | {"level_0.points": bucket(points)}).items()))
+
+
 def block_memory(
     network: Network, limits: Limits, variables: Variables, encoded: image.Encoded
 ) -> int:
@@ -163,7 +170,8 @@ def block_memory(
     zeros = np.zeros((rows, 3), np.float32)
     queries = Oriented(zeros, zeros, np.ones(rows, bool))
     flat = image.only(limits, network.query.name)
-    lowered = image.shade_block.lower(network, flat, variables, encoded, queries)
+    arrays = network, flat, variables, encoded, queries
+    lowered = image.shade_block.lower(*arrays, coherent=True)
     memory = lowered.compile().memory_analysis()
     return int(memory.temp_size_in_bytes) if memory else 0
 

@@ -25,6 +25,7 @@ from ginn_jax.architecture import Network
 from ginn_jax.checkpoint import load_weights
 from ginn_jax.commandline import require, start
 from ginn_jax.dataset import ShadedPoints
+from ginn_jax.disk_radius import with_disk_radius
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import View, image_errors, reference_view
 from ginn_jax.geometry import (
@@ -41,7 +42,6 @@ from ginn_jax.image import (
     encode_cloud,
     shade_image,
     shade_points,
-    with_disk_radius,
 )
 from ginn_jax.mesh import Samples, find_meshes
 from ginn_jax.metrics import mse

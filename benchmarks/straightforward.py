@@ -1,8 +1,10 @@
 """f_2D as one would first write it: the yardstick of `benchmarks.f2d`.
 
-Each pixel looks up the nine columns of the grid around it, lists the candidates of its
-runs, tests them one by one, compacts the list to edges, gathers both ends of each edge,
-evaluates the kernel row by row and sums by `segment_sum`, all pixels at once.
+Nothing in it but the layers' shapes is the library's: points are sorted by the key of
+their cell, each pixel finds the nine runs of cells around it by binary search, the runs
+are expanded to one list with `jnp.repeat`, tested one by one, compacted to edges with
+`jnp.nonzero`, both ends of each edge gathered, the kernel evaluated row by row, and the
+results summed by `segment_sum`, all pixels at once.
 """
 
 from typing import Any
@@ -15,25 +17,30 @@ from ginn_jax.architecture import Network
 from ginn_jax.mcconv import Kernel
 from ginn_jax.network import SLOPE, Variables
 from ginn_jax.receptive_field import Oriented
-from ginn_jax.voxels import VoxelGrid, cell_of, compact, expand_ranges, narrow_runs
+
+# Cells an axis at most: three of them make a key of 30 bits.
+CELLS = 1 << 10
 
 
 def nine_runs(
-    grid: VoxelGrid, query: Float[Array, "M 3"], radius: Float[Array, ""]
-) -> tuple[Int[Array, "M*9"], Int[Array, "M*9"]]:
-    """Start and length of the runs of rows in the columns around each query."""
-    step = jnp.arange(3, dtype=jnp.int32) - 1
-    x, y = (cell_of(grid, query[:, a], a)[:, None] + step for a in (0, 1))
-    inside = ((x >= 0) & (x < grid.shape[0]))[:, :, None]
-    inside &= ((y >= 0) & (y < grid.shape[1]))[:, None]
-    column = jnp.where(inside, x[:, :, None] * grid.shape[1] + y[:, None], 0)
-    first = grid.column_start[column]
-    last = jnp.where(inside, grid.column_start[column + 1], first)
-    reach = 1.00001 * radius
-    low, high = (cell_of(grid, query[:, 2] + d, 2) for d in (-reach, reach))
-    low, high = (jnp.broadcast_to(a[:, None, None], first.shape) for a in (low, high))
-    start, stop = narrow_runs(grid.layer, first, last, low, high + 1)
-    return start.reshape(-1), (stop - start).reshape(-1)
+    points: Oriented, query: Float[Array, "M 3"], radius: Float[Array, ""]
+) -> tuple[Int[Array, "N"], Int[Array, "M*9"], Int[Array, "M*9"]]:
+    """Points in order of their cells; start and length of the runs at each query."""
+    far = jnp.where(points.mask[:, None], points.position, jnp.inf)
+    low = jnp.min(far, axis=0)
+    cell = jnp.floor((far - low) / (1.0001 * radius)).astype(jnp.int32)
+    cell = jnp.clip(cell + 1, 0, CELLS - 1)
+    key = (cell[:, 0] * CELLS + cell[:, 1]) * CELLS + cell[:, 2]
+    key = jnp.where(points.mask, key, jnp.int32(2**31 - 1))
+    order = jnp.argsort(key)
+    own = jnp.floor((query - low) / (1.0001 * radius)).astype(jnp.int32) + 1
+    step = jnp.arange(-1, 2)
+    x, y = (jnp.clip(own[:, a, None] + step, 0, CELLS - 1) for a in (0, 1))
+    column = (x[:, :, None] * CELLS + y[:, None]).reshape(-1, 9) * CELLS
+    z = jnp.clip(own[:, 2, None], 1, CELLS - 2)
+    start = jnp.searchsorted(key[order], column + z - 1)
+    stop = jnp.searchsorted(key[order], column + z + 1, side="right")
+    return order, start.reshape(-1), (stop - start).reshape(-1)
 
 
 def shade_plainly(
@@ -45,15 +52,19 @@ def shade_plainly(
     queries: Oriented,
 ) -> tuple[Float[Array, "M"], Int[Array, ""], Int[Array, ""]]:
     """f_2D of all queries at once, and the candidates and edges that took."""
-    radius = jnp.float32(network.query.radius)
-    grid, points = encoded.grid, encoded.points
-    start, length = nine_runs(grid, queries.position, radius)
-    slots, tested = expand_ranges(start, length, candidates)
-    owner = slots.owner // 9
-    squared = jnp.sum((queries.position[owner] - grid.position[slots.row]) ** 2, -1)
-    kept, real, found = compact(slots.valid & (squared < radius**2), edges)
-    sender = jnp.where(real, grid.index[slots.row[kept]], 0)
-    receiver = jnp.where(real, owner[kept], 0)
+    radius, points = jnp.float32(network.query.radius), encoded.points
+    order, start, length = nine_runs(points, queries.position, radius)
+    end = jnp.cumsum(length)
+    run = jnp.repeat(jnp.arange(length.size), length, total_repeat_length=candidates)
+    place = jnp.arange(candidates)
+    sender = order[start[run] + place - (end[run] - length[run])]
+    owner = run // 9
+    squared = jnp.sum((queries.position[owner] - points.position[sender]) ** 2, -1)
+    near = (place < end[-1]) & (squared < radius**2)
+    found = jnp.sum(near)
+    kept = jnp.nonzero(near, size=edges)[0]
+    real = jnp.arange(edges) < found
+    sender, receiver = sender[kept], owner[kept]
     offset = (queries.position[receiver] - points.position[sender]) / radius
     ends = queries.normal[receiver], points.normal[sender]
     pairs = (ends[0], offset), (ends[1], offset), ends, (offset, offset)
@@ -63,7 +74,7 @@ def shade_plainly(
     kernel = Kernel(*variables["shader"]["params"]["query"]["kernel"])
     values = perceptron(kernel, inputs) * encoded.code.free[sender] * weight[:, None]
     x = jax.ops.segment_sum(values, receiver, queries.mask.shape[0])
-    return head(variables["shader"]["params"], x, queries.normal), tested, found
+    return head(variables["shader"]["params"], x, queries.normal), end[-1], found
 
 
 def perceptron(kernel: Kernel, inputs: Float[Array, "E D"]) -> Float[Array, "E K"]:

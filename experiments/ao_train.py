@@ -17,6 +17,7 @@ from rich.console import Console
 
 from ginn_jax import architecture, evaluate, fit, objects, report, scenes
 from ginn_jax.commandline import require_positive, start
+from ginn_jax.disk_radius import limits_at, with_disk_radius
 from ginn_jax.experiment import (
     Clock,
     RunOptions,
@@ -27,7 +28,6 @@ from ginn_jax.experiment import (
     training,
 )
 from ginn_jax.geometry import Limits
-from ginn_jax.image import limits_at, with_disk_radius
 from ginn_jax.mesh import find_meshes
 from ginn_jax.train import Training
 

@@ -19,9 +19,9 @@ from ginn_jax import compare, compare_report, evaluate, evaluate_light, report
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
 from ginn_jax.compare import Picture, Shot, Trained
+from ginn_jax.disk_radius import limits_at, with_disk_radius
 from ginn_jax.evaluate import Row
 from ginn_jax.experiment import make
-from ginn_jax.image import limits_at, with_disk_radius
 from ginn_jax.lighting import find_environments
 from ginn_jax.lit_clouds import LitCloud, mean_light, split_points
 from ginn_jax.lit_experiment import UNSEEN_SEED

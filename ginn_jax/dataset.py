@@ -143,9 +143,10 @@ def relative_to(
     center: Float[Any, "3"] | None, position: Float[np.ndarray, "N 3"]
 ) -> Float[np.ndarray, "N 3"]:
     """Coordinates counted from there, the difference taken in float64."""
-    if center is None:
+    position = np.asarray(position)
+    if center is None or (position.dtype == np.float32 and not np.any(center)):
         return np.asarray(position, np.float32)
-    return (np.asarray(position, np.float64) - np.asarray(center)).astype(np.float32)
+    return (position.astype(np.float64) - np.asarray(center)).astype(np.float32)
 
 
 def unit_light(

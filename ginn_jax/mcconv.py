@@ -50,18 +50,24 @@ def init_kernel(
 
 def evaluate_kernel(
     kernel: Kernel, inputs: Float[Array, "D E"], outputs: int
-) -> Float[Array, "E K"]:
+) -> Float[Array, "K E"]:
     """Kernel values of every edge: a perceptron with two ReLU layers per block."""
 
     def block(
         w1: Array, b1: Array, w2: Array, b2: Array, w3: Array, b3: Array
-    ) -> Float[Array, "E K"]:
-        hidden = jax.nn.relu(jnp.einsum("ih,ie->he", w1, inputs) + b1[:, None])
-        hidden = jax.nn.relu(jnp.einsum("ih,ie->he", w2, hidden) + b2[:, None])
-        return jnp.einsum("hk,he->ek", w3, hidden) + b3
+    ) -> Float[Array, "K E"]:
+        w1, w2, w3 = (jax.lax.optimization_barrier(w.T) for w in (w1, w2, w3))
+        hidden = jax.nn.relu(w1 @ inputs + b1[:, None])
+        hidden = jax.nn.relu(w2 @ hidden + b2[:, None])
+        return w3 @ hidden + b3[:, None]
 
     values = [block(*(a[i] for a in kernel)) for i in range(kernel.w1.shape[0])]
-    return jnp.concatenate(values, axis=-1)[:, :outputs]
+    return jnp.concatenate(values)[:outputs]
+
+
+def edges_first(values: Float[Array, "K E"]) -> Float[Array, "E K"]:
+    """The transpose, by itself: the matrix product before it is much slower with it."""
+    return jax.lax.optimization_barrier(values).T
 
 
 def mc_conv(
@@ -86,7 +92,7 @@ def stored_kernel(kernel: Kernel, field: Field) -> Float[Array, "K E"]:
     """Weighted kernel values of every edge, for `apply_stored`."""
     outputs = kernel.w1.shape[0] * kernel.w3.shape[2]
     values = evaluate_kernel(kernel, field.inputs, outputs)
-    return (values * field.weight[:, None]).T
+    return values * field.weight
 
 
 def apply_stored(
@@ -118,7 +124,8 @@ def _depth_wise(
     weight: Float[Array, "T"],
 ) -> Float[Array, "T C"]:
     """What every edge of a tile adds to its receiver."""
-    return evaluate_kernel(kernel, inputs, outputs) * features * weight[:, None]
+    values = evaluate_kernel(kernel, inputs, outputs) * weight
+    return edges_first(values) * features
 
 
 def _mixing(
@@ -129,9 +136,9 @@ def _mixing(
     weight: Float[Array, "T"],
 ) -> Float[Array, "T K"]:
     """What every edge of a tile adds to its receiver, every channel from all."""
-    values = evaluate_kernel(kernel, inputs, outputs * features.shape[1])
-    values = values.reshape(-1, outputs, features.shape[1])
-    return jnp.sum(values * features[:, None], axis=-1) * weight[:, None]
+    values = evaluate_kernel(kernel, inputs, outputs * features.shape[1]) * weight
+    values = edges_first(values).reshape(-1, outputs, features.shape[1])
+    return jnp.sum(values * features[:, None], axis=-1)
 
 
 class _Tile(NamedTuple):

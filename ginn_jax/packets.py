@@ -132,9 +132,8 @@ def packet_columns(
     """The columns that each packet has to look into, and how many in all."""
     far = jnp.float32(jnp.finfo(jnp.float32).max)
     reach = 1.00001 * radius
-    lanes = (-1, PACKET, 3)
-    low = jnp.min(jnp.where(mask[:, None], query, far).reshape(lanes), axis=1)
-    high = jnp.max(jnp.where(mask[:, None], query, -far).reshape(lanes), axis=1)
+    low = _of_packets(jnp.minimum, jnp.where(mask[:, None], query, far))
+    high = _of_packets(jnp.maximum, jnp.where(mask[:, None], query, -far))
     empty = low[:, :1] > high[:, :1]
     low = jnp.where(empty, 0.0, low) - reach
     high = jnp.where(empty, 0.0, high) + reach
@@ -148,6 +147,16 @@ def packet_columns(
     shape = jnp.where(empty, 0, shape)
     total = saturating_sum(shape[:, 0] * shape[:, 1])
     return Columns(low, high, first, shape), total
+
+
+def _of_packets(
+    extreme: Callable[[Array, Array], Array], query: Float[Array, "M 3"]
+) -> Float[Array, "P 3"]:
+    """The extreme of each packet by halving: XLA's own reduction is scalar on CPU."""
+    lanes = query.T.reshape(3, -1, PACKET)
+    while lanes.shape[2] > 1:
+        lanes = extreme(*jnp.split(lanes, 2, axis=2))
+    return lanes[:, :, 0].T
 
 
 def packet_candidates(

@@ -12,6 +12,7 @@ Edges are taken in tiles that fit a core's cache, as many as hold real edges: pa
 costs memory, not time.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -21,7 +22,8 @@ from jaxtyping import Array, Bool, Float, Int
 from ginn_jax.packets import Edges
 from ginn_jax.voxels import expand_ranges, morton_order
 
-TILE = 8192
+# Not a power of two, or the rows of a tile would share the same few lines of a cache.
+TILE = 4112
 
 
 class Field(NamedTuple):
@@ -85,16 +87,20 @@ def kernel_inputs(
     of either surface the other point lies on, whatever the azimuth.
     """
     real = edges.receiver < receivers.position.shape[0]
-    ends = (receivers, jnp.where(real, edges.receiver, 0)), (senders, edges.sender)
-    x, y = (
-        take_columns(
-            jnp.concatenate([p.position, p.normal], axis=1).T, index, edges.demand.edges
-        )
-        for p, index in ends
+    rows = jnp.where(real, edges.receiver, 0), edges.sender
+    ends = tuple(
+        jnp.concatenate([p.position, p.normal], axis=1) for p in (receivers, senders)
     )
+    return _inputs_in_tiles(oriented, *ends, radius, *rows, edges.demand.edges)
+
+
+def _pair_inputs(
+    oriented: bool, x: Float[Array, "6 E"], y: Float[Array, "6 E"], radius: Array
+) -> Float[Array, "D E"]:
+    """`kernel_inputs` of receivers x and senders y, position above normal."""
     offset, normal_x, normal_y = (x[:3] - y[:3]) / radius, x[3:], y[3:]
     if not oriented:
-        return jnp.where(real, offset, 0.0)
+        return offset
     pairs = (
         (normal_x, offset),
         (normal_y, offset),
@@ -102,43 +108,63 @@ def kernel_inputs(
         (offset, offset),
     )
     products = [jnp.sum(a * b, axis=0, keepdims=True) for a, b in pairs]
-    return jnp.where(real, jnp.concatenate([offset, *products]), 0.0)
+    return jnp.concatenate([offset, *products])
 
 
-@jax.custom_vjp
-def take_columns(
-    table: Float[Array, "C N"], index: Int[Array, "E"], count: Int[Array, ""]
-) -> Float[Array, "C E"]:
-    """`table[:, index]` for the first `count` indices, in tiles; further ones may be 0.
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _inputs_in_tiles(
+    oriented: bool,
+    receivers: Float[Array, "M 6"],
+    senders: Float[Array, "N 6"],
+    radius: Float[Array, ""],
+    receiver: Int[Array, "E"],
+    sender: Int[Array, "E"],
+    count: Int[Array, ""],
+) -> Float[Array, "D E"]:
+    """Kernel inputs of the first `count` edges, 0 for the others, tile by tile.
 
     A loop of its own, so that XLA does not gather anew for each use of the result.
     """
-    size = tile_size(index.shape[0])
+    edges = receiver.shape[0]
+    size = tile_size(edges)
 
-    def take(number: Int[Array, ""], taken: Float[Array, "C E"]) -> Array:
-        start = jnp.minimum(number * size, index.shape[0] - size)
-        some = jax.lax.dynamic_slice_in_dim(index, start, size)
-        return jax.lax.dynamic_update_slice_in_dim(taken, table[:, some], start, axis=1)
+    def fill(number: Int[Array, ""], inputs: Float[Array, "D E"]) -> Array:
+        start = jnp.minimum(number * size, edges - size)
+        x, y = (
+            jax.lax.optimization_barrier(
+                table[jax.lax.dynamic_slice_in_dim(rows, start, size)]
+            ).T
+            for table, rows in ((receivers, receiver), (senders, sender))
+        )
+        real = start + jnp.arange(size, dtype=jnp.int32) < count
+        some = jnp.where(real, _pair_inputs(oriented, x, y, radius), 0.0)
+        return jax.lax.dynamic_update_slice_in_dim(inputs, some, start, axis=1)
 
-    tiles = tile_count(index.shape[0], count)
-    nothing = jnp.zeros((table.shape[0], index.shape[0]), table.dtype)
-    return jax.lax.fori_loop(0, tiles, take, nothing)
-
-
-def _take_forward(
-    table: Float[Array, "C N"], index: Int[Array, "E"], count: Int[Array, ""]
-) -> tuple[Float[Array, "C E"], Any]:
-    return take_columns(table, index, count), (table, index, count)
-
-
-def _take_backward(inputs: Any, cotangent: Float[Array, "C E"]) -> Any:
-    table, index, count = inputs
-    real = jnp.arange(index.shape[0]) < count
-    given = jnp.where(real, cotangent, 0.0)
-    return jnp.zeros_like(table).at[:, index].add(given), None, None
+    nothing = jnp.zeros((7 if oriented else 3, edges), senders.dtype)
+    return jax.lax.fori_loop(0, tile_count(edges, count), fill, nothing)
 
 
-take_columns.defvjp(_take_forward, _take_backward)
+def _inputs_forward(
+    oriented: bool, *arrays: Array
+) -> tuple[Float[Array, "D E"], tuple[Array, ...]]:
+    return _inputs_in_tiles(oriented, *arrays), arrays
+
+
+def _inputs_backward(
+    oriented: bool, arrays: tuple[Array, ...], cotangent: Float[Array, "D E"]
+) -> tuple[Array | None, ...]:
+    """Cotangents of both ends and the radius, all edges at once."""
+    *ends, receiver, sender, count = arrays
+    real = jnp.arange(receiver.shape[0], dtype=jnp.int32) < count
+
+    def plainly(x: Array, y: Array, radius: Array) -> Float[Array, "D E"]:
+        return _pair_inputs(oriented, x[receiver].T, y[sender].T, radius)
+
+    _, pull = jax.vjp(plainly, *ends)
+    return *pull(jnp.where(real, cotangent, 0.0)), None, None, None
+
+
+_inputs_in_tiles.defvjp(_inputs_forward, _inputs_backward)
 
 
 def kde_weight(

@@ -93,9 +93,16 @@ def shade(
     queries: Oriented,
     material: Float[Array, "C M A"] | None = None,
     light: Float[Array, "C M L"] | None = None,
+    *,
+    coherent: bool = False,
 ) -> tuple[Float[Array, "*C M"], Demands]:
-    """f_2D with its search, for one block of queries in any order."""
-    queries, order = in_coherent_order(queries)
+    """f_2D with its search, for one block of queries in any order.
+
+    Where they come `coherent`, neighbours together, sorting them is left out.
+    """
+    order = None
+    if not coherent:
+        queries, order = in_coherent_order(queries)
     field, demands = build_query_field(
         network, limits, encoded.points, encoded.grid, encoded.area, queries
     )
@@ -110,13 +117,13 @@ def shade_channels(
     variables: Variables,
     field: Field,
     queries: Oriented,
-    order: Int[Array, "M"],
+    order: Int[Array, "M"] | None,
     code: Code,
     scale: Float[Array, "C"] | None,
     material: Float[Array, "C M A"] | None,
     light: Float[Array, "C M L"] | None,
 ) -> Float[Array, "*C M"]:
-    """f_2D of every channel; `order` are the rows that the sorted queries came from."""
+    """f_2D of every channel; `order`: the rows that sorted queries came from."""
 
     def channel(
         code: Code, scale: Array | None, material: Array | None, light: Array | None
@@ -129,7 +136,8 @@ def shade_channels(
         values: Any = shader.apply(
             variables["shader"], code, *asked, queries.mask, field
         )
-        values = jnp.zeros_like(values).at[order].set(values)
+        if order is not None:
+            values = jnp.zeros_like(values).at[order].set(values)
         return values if scale is None else values * scale
 
     if network.asks == "normal":
@@ -147,10 +155,9 @@ def per_channel(function: Any, *arrays: Any) -> Any:
 
 def take_rows(
     columns: tuple[Array | None, Array | None],
-    rows: Int[Array, "M"],
+    rows: Int[Array, "M"] | None,
     mask: Bool[Array, "M"],
 ) -> tuple[Array | None, ...]:
-    """Rows of what there is, zero where masked."""
-    return tuple(
-        None if a is None else jnp.where(mask[:, None], a[rows], 0.0) for a in columns
-    )
+    """Rows of what there is, or all in their order, zero where masked."""
+    taken = (a if a is None or rows is None else a[rows] for a in columns)
+    return tuple(None if a is None else jnp.where(mask[:, None], a, 0.0) for a in taken)

@@ -32,12 +32,12 @@ def sample_pixels(size: int, scale: float) -> Int[np.ndarray, "S"]:
 
 
 def upsample(
-    values: Float[Array, "h w"],
+    values: Float[Array, "h w *C"],
     rows: Int[Array, "h"],
     columns: Int[Array, "w"],
     surface: Surface,
     thickness: Float[Array, ""],
-) -> tuple[Float[Array, "H W"], Bool[Array, "H W"]]:
+) -> tuple[Float[Array, "H W *C"], Bool[Array, "H W"]]:
     """Values of all pixels from those at `rows` x `columns`, and which have one.
 
     `thickness` is how far a sample may lie off a pixel's tangent plane, as a standard
@@ -46,17 +46,24 @@ def upsample(
     height, width = surface.mask.shape
     above, down = _between(rows, height)
     left, right = _between(columns, width)
-    total = jnp.zeros((height, width))
+    channels = tuple(range(2, values.ndim))
+    total = jnp.zeros((height, width, *values.shape[2:]))
     weight = jnp.zeros((height, width))
-    for i, share_i in ((above, 1 - down), (above + 1, down)):
-        for j, share_j in ((left, 1 - right), (left + 1, right)):
-            i, j = jnp.clip(i, 0, rows.size - 1), jnp.clip(j, 0, columns.size - 1)
-            there = jax.tree.map(lambda a: a[rows[i]][:, columns[j]], surface)  # noqa: B023
-            share = _likeness(surface, there, thickness) * share_i[:, None] * share_j
-            total += share * values[i][:, j]
+    for j, share_j in ((left, 1 - right), (left + 1, right)):
+        j = jnp.clip(j, 0, columns.size - 1)
+        column = jax.tree.map(lambda a: a[rows][:, columns[j]], surface)  # noqa: B023
+        # Columns first and once: they cost much more than the rows, which are whole.
+        column = jax.lax.optimization_barrier((*column, values[:, j]))
+        for i, share_i in ((above, 1 - down), (above + 1, down)):
+            i = jnp.clip(i, 0, rows.size - 1)
+            *there, value = (a[i] for a in column)
+            share = _likeness(surface, Surface(*there), thickness)
+            share = share * share_i[:, None] * share_j
+            total += jnp.expand_dims(share, channels) * value
             weight += share
     known = surface.mask & (weight > LEAST_WEIGHT)
-    return jnp.where(known, total / jnp.where(known, weight, 1.0), 0.0), known
+    inverse = jnp.where(known, 1 / jnp.where(known, weight, 1.0), 0.0)
+    return total * jnp.expand_dims(inverse, channels), known
 
 
 def _between(

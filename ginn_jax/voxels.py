@@ -95,10 +95,21 @@ def morton_order(
     position: Float[Array, "N 3"], mask: Bool[Array, "N"]
 ) -> Int[Array, "N"]:
     """Rows along a space-filling curve, masked ones last: neighbours come together."""
-    origin, extent = _bounds(position, mask)
     room = 31 - max(position.shape[0] - 1, 1).bit_length()
     # One sort has room for so many bits; a large cloud wants finer cells than that.
     bits = room // 3 if room // 3 >= FINE_ENOUGH else min(2 * room // 3, 10)
+    code = morton_code(position, mask, bits)
+    if 3 * bits <= room:
+        return stable_order(code, room)
+    order = stable_order(code & jnp.uint32((1 << room) - 1), room)
+    return order[stable_order(code[order] >> room, 3 * bits + 1 - room)]
+
+
+def morton_code(
+    position: Float[Array, "N 3"], mask: Bool[Array, "N"], bits: int
+) -> UInt32[Array, "N"]:
+    """Places along a curve through 2^bits cells an axis; masked points are beyond."""
+    origin, extent = _bounds(position, mask)
     side = jnp.max(extent) / (1 << bits)
     cell = jnp.floor((position - origin) / jnp.where(side > 0, side, 1.0))
     cell = jnp.clip(cell, 0, (1 << bits) - 1).astype(jnp.uint32)
@@ -106,11 +117,7 @@ def morton_order(
     for bit in range(bits):
         for axis in range(3):
             code |= ((cell[:, axis] >> bit) & 1) << (3 * bit + axis)
-    code = jnp.where(mask, code, jnp.uint32(1 << (3 * bits)))
-    if 3 * bits <= room:
-        return stable_order(code, room)
-    order = stable_order(code & jnp.uint32((1 << room) - 1), room)
-    return order[stable_order(code[order] >> room, 3 * bits + 1 - room)]
+    return jnp.where(mask, code, jnp.uint32(1 << (3 * bits)))
 
 
 def _bounds(

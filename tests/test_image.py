@@ -1,17 +1,13 @@
 """Values at points and pixels, by a network with its initial parameters."""
 
-import re
-from dataclasses import replace
-
 import jax
 import numpy as np
 import pytest
 import tiny
 
 from ginn_jax import image
-from ginn_jax.architecture import DEFAULT
 from ginn_jax.errors import InputError
-from ginn_jax.geometry import Limits, limits_for
+from ginn_jax.geometry import Limits
 
 KEY = jax.random.key(3)
 PIXELS = 300
@@ -151,9 +147,9 @@ def test_number_of_blocks_is_that_of_the_foreground(
 ):
     calls, shade_block = [], image.shade_block
 
-    def counted(*arguments):
+    def counted(*arguments, **options):
         calls.append(int(arguments[4].mask.sum()))
-        return shade_block(*arguments)
+        return shade_block(*arguments, **options)
 
     monkeypatch.setattr(image, "shade_block", counted)
     mask = np.arange(24 * 25).reshape(24, 25) >= 300
@@ -207,78 +203,6 @@ def test_openness_lies_between_0_and_1():
     np.testing.assert_array_equal(image.as_openness(values), [0, 0, 0.25, 1, 1, 1])
 
 
-def test_other_disk_radius_changes_the_finest_level_only():
-    other = image.with_disk_radius(tiny.NETWORK, 0.05)
-    assert other == replace(tiny.NETWORK, levels=(0.05, 0.2))
-
-
-@pytest.mark.parametrize("radius", [0.0, -0.1, 0.16, 0.3, np.nan, np.inf])
-def test_unusable_disk_radius_is_refused(radius):
-    with pytest.raises(InputError, match=rf"^Poisson radius {re.escape(str(radius))}"):
-        image.with_disk_radius(tiny.NETWORK, radius)
-
-
-def test_disk_radius_beyond_level_1_is_refused():
-    network = replace(tiny.NETWORK, levels=(0.08, 0.1))
-    with pytest.raises(InputError, match=r"exceeds level 1's 0\.1"):
-        image.with_disk_radius(network, 0.12)
-
-
-# What the default network needed of 20,000 samples of a procedural shape, and of 16,384
-# pixels, at disk radii .015, .02 and .03.
-DEMANDS = {
-    "level_0": {
-        "columns": (14618, 9675, 6289),
-        "candidates": (117501, 134843, 185261),
-        "words": (3964, 4517, 6095),
-        "edges": (39902, 71618, 163770),
-        "points": (6855, 4520, 2304),
-    },
-    "level_1": {
-        "columns": (11626, 10704, 8785),
-        "candidates": (44230, 25667, 10565),
-        "words": (1493, 872, 365),
-        "edges": (48372, 19954, 4730),
-        "points": (865, 812, 733),
-    },
-    "conv_0": {
-        "columns": (11626, 10704, 8785),
-        "candidates": (44230, 25667, 10565),
-        "words": (1493, 872, 365),
-        "edges": (103599, 44428, 11764),
-    },
-    "up_1": {
-        "columns": (4315, 3634, 2718),
-        "candidates": (8015, 6335, 4428),
-        "words": (345, 274, 176),
-        "edges": (29415, 18179, 8297),
-    },
-    "query": {
-        "columns": (15520, 15520, 15520),
-        "candidates": (53084, 34891, 17623),
-        "words": (1912, 1356, 758),
-        "edges": (118052, 77320, 38540),
-    },
-}
-
-
-@pytest.mark.parametrize(("radius", "column"), [(0.015, 0), (0.02, 1), (0.03, 2)])
-def test_limits_at_another_radius_are_those_that_suffice(radius, column):
-    """Those of radius .02, with the usual slack, made into those of another."""
-    found = {f"{s}.{p}": n for s, parts in DEMANDS.items() for p, n in parts.items()}
-    usual = limits_for({name: n[1] for name, n in found.items()}, image.SLACK)
-    scaled = image.limits_at(DEFAULT, usual, radius)
-    assert set(dict(scaled.sizes)) == set(found)
-    for name, demands in found.items():
-        size = scaled.of(name)
-        assert demands[column] <= size <= 1.8 * demands[column] + 64, name
-
-
-def test_other_limits_do_not_go_with_the_radius():
-    limits = Limits((("level_2.edges", 640), ("conv_1.edges", 4096)))
-    assert image.limits_at(DEFAULT, limits, 0.01) == limits
-
-
 def ground_picture():
     """Level ground seen from above, a pixel .02 wide, a strip of it missing."""
     x, z = np.meshgrid(np.linspace(-0.3, 0.3, 32), np.linspace(-0.3, 0.3, 30))
@@ -290,9 +214,9 @@ def ground_picture():
 def test_a_lower_rate_computes_fewer_pixels(variables, encoded, monkeypatch):
     shaded, shade_points = [], image.shade_points
 
-    def counted(*arguments):
+    def counted(*arguments, **options):
         shaded.append(len(arguments[4]))
-        return shade_points(*arguments)
+        return shade_points(*arguments, **options)
 
     monkeypatch.setattr(image, "shade_points", counted)
     position, normal, mask = ground_picture()

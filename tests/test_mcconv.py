@@ -461,15 +461,35 @@ def test_tiles_change_nothing(monkeypatch):
     assert not np.asarray(parts[1][3])[count:].any()
 
 
-def test_gathered_columns_have_the_gradient_of_a_gather():
+def test_kernel_inputs_have_the_gradient_of_their_formula(monkeypatch):
+    """Tiles and all, against central differences in float64; padding has none."""
+    monkeypatch.setattr(rf, "TILE", 4)
     rng = np.random.default_rng(3)
-    table = jnp.asarray(rng.normal(size=(2, 6)), jnp.float32)
-    index = jnp.asarray(rng.integers(0, 6, 10), jnp.int32)
+    ends = [rng.normal(size=(n, 6)).astype(np.float32) for n in (5, 6)]
+    receiver, sender = rng.integers(0, 5, 10), rng.integers(0, 6, 10)
+    wanted, count = rng.normal(size=(7, 10)), 7
 
-    def total(table):
-        taken = rf.take_columns(table, index, jnp.int32(7))
-        return jnp.sum(jnp.where(np.arange(10) < 7, taken**2, 0.0))
+    def total(x, y):
+        x, y = x[receiver[:count]], y[sender[:count]]
+        offset, n, m = (x[:, :3] - y[:, :3]) / 0.5, x[:, 3:], y[:, 3:]
+        dots = [(a * b).sum(1) for a, b in ((n, offset), (m, offset), (n, m))]
+        rows = [*offset.T, *dots, (offset**2).sum(1)]
+        return float((np.stack(rows) * wanted[:, :count]).sum())
 
-    slope, values = np.zeros((2, 6)), np.asarray(table)
-    np.add.at(slope.T, index[:7], 2 * values.T[index[:7]])
-    np.testing.assert_allclose(jax.grad(total)(table), slope, rtol=1e-6)
+    def ours(x, y):
+        rows = jnp.asarray(receiver, jnp.int32), jnp.asarray(sender, jnp.int32)
+        inputs = rf._inputs_in_tiles(
+            True, x, y, jnp.float32(0.5), *rows, jnp.int32(count)
+        )
+        return jnp.sum(inputs * wanted)
+
+    np.testing.assert_allclose(ours(*map(jnp.asarray, ends)), total(*ends), rtol=1e-5)
+    slopes = jax.grad(ours, argnums=(0, 1))(*map(jnp.asarray, ends))
+    ends = [e.astype(np.float64) for e in ends]
+    for end, slope in enumerate(slopes):
+        for place in np.ndindex(ends[end].shape):
+            low, high = ([e.copy() for e in ends] for _ in range(2))
+            low[end][place] -= 1e-4
+            high[end][place] += 1e-4
+            expected = (total(*high) - total(*low)) / 2e-4
+            np.testing.assert_allclose(slope[place], expected, rtol=1e-4, atol=1e-4)
