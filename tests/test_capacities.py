@@ -147,8 +147,8 @@ def counted(monkeypatch, name):
     """What each call of a function of `image` said that it needed."""
     calls, function = [], getattr(image, name)
 
-    def called(*args):
-        result = function(*args)
+    def called(*args, **options):
+        result = function(*args, **options)
         calls.append({n: int(d) for n, d in jax.device_get(result[1]).items()})
         return result
 
