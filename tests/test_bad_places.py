@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 import tiny
 import trimesh
-from test_bad_files import STATE, contents, refused, restore, save_state
+from damaged import contents, refused
+from saved import STATE, restore, save_state
 
 from experiments import ao_train, gi_train
 from ginn_jax import checkpoint, commandline, dataset, fit, lighting, mesh

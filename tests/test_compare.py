@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from experiments import evaluate as experiment
 from ginn_jax import checkpoint, compare_report
-from ginn_jax.compare import OURS
+from ginn_jax.compare_networks import OURS
 from ginn_jax.compare_report import (
     RIVALS,
     inset_place,

@@ -9,7 +9,7 @@ import pytest
 import tiny
 
 from experiments import animation, environment_maps, latent_features
-from ginn_jax import compare, train
+from ginn_jax import compare_networks, train
 from ginn_jax.errors import InputError
 
 
@@ -26,7 +26,7 @@ def untrained(effect):
 
 @pytest.fixture(autouse=True)
 def tiny_networks(monkeypatch):
-    for module in (compare, environment_maps, latent_features):
+    for module in (compare_networks, environment_maps, latent_features):
         monkeypatch.setattr(
             module, "load_pretrained", lambda name: untrained(name.split("_")[0])
         )
