@@ -29,6 +29,7 @@ from ginn_jax.image import (
 )
 from ginn_jax.lit_clouds import LitCloud, mean_light, network_numbers, split_points
 from ginn_jax.neighbors import bucket
+from ginn_jax.objects import Source
 from ginn_jax.pretrained import load_pretrained
 from ginn_jax.receptive_field import Oriented
 from ginn_jax.scenes import Occlusion, Settings
