@@ -1,7 +1,7 @@
 """Limits of a network on a cloud: every one in turn too small, measured, raised."""
 
-import jax
 import pytest
+import tiny
 from hypothesis import given
 from hypothesis import strategies as st
 from small_sphere import (
@@ -18,12 +18,10 @@ from ginn_jax import geometry as ge
 from ginn_jax.architecture import PRESETS
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick_compilation():
-    """Most of the time here is XLA's."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
+@pytest.fixture(autouse=True, scope="module")
+def _cheap_compiling():
+    with tiny.cheap_compiling():
+        yield
 
 
 @pytest.fixture(scope="module")
