@@ -19,7 +19,10 @@ from rich.console import Console
 from ginn_jax import compare, compare_report, evaluate_light, report, sequences
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
-from ginn_jax.compare import Shot, Stage, Trained
+from ginn_jax.compare import Shot, Stage
+from ginn_jax.compare_networks import Trained, load_networks, network_values
+from ginn_jax.compare_screen import screen_pictures
+from ginn_jax.compare_tracing import trace
 from ginn_jax.dataset import ShadedPoints
 from ginn_jax.evaluate import View
 from ginn_jax.experiment import bar
@@ -75,7 +78,7 @@ def main(options: Options) -> dict[str, Any]:
     meshes = choose_frames(options, ground=options.effect != "sss")
     light = choose_light(options)
     key = jax.random.key(options.seed)
-    networks = compare.load_networks(options.effect, (None,) * 3, key=key)
+    networks = load_networks(options.effect, (None,) * 3, key=key)
     carried = sequences.carried_samples(meshes[0], options.points, seed=options.seed)
     frames: dict[str, list[np.ndarray]] = {}
     with bar(console) as progress:
@@ -124,14 +127,14 @@ def shade_frame(
     camera = orbit_camera(width=size, height=size)
     given, stage, units = stage_of(options, settings, mesh, light, samples)
     shot = compare.take_shot(stage, camera, settings, seed=options.seed)
-    truth = compare.trace(shot, settings, options.reference, seed=options.seed)
+    truth = trace(shot, settings, options.reference, seed=options.seed)
     values = {"reference": truth.mean, "variance": truth.variance}
-    for picture in compare.screen_pictures(
+    for picture in screen_pictures(
         compare.with_truth(shot, truth), camera, settings, units
     ):
         values[picture.row["method"]] = picture.values
     for name, trained in networks.items():
-        values[name], networks[name] = compare.network_values(trained, given, shot)
+        values[name], networks[name] = network_values(trained, given, shot)
     mask = shot.gbuffer.mask
     images = {n: evaluate_light.fill(mask, np.asarray(v)) for n, v in values.items()}
     return images | {"mask": mask, "albedo": albedo_of(shot)}, networks

@@ -15,15 +15,25 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from ginn_jax import compare, compare_report, evaluate, evaluate_light, report
+from ginn_jax import compare, compare_report, report
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
-from ginn_jax.compare import Picture, Shot, Trained
+from ginn_jax.compare import Shot
+from ginn_jax.compare_networks import (
+    OURS,
+    Trained,
+    errors_at_points,
+    load_networks,
+    network_memory,
+    network_picture,
+    points_given,
+)
+from ginn_jax.compare_screen import screen_pictures
+from ginn_jax.compare_tracing import denoised_picture, traced_picture, with_reference
 from ginn_jax.disk_radius import limits_at, with_disk_radius
 from ginn_jax.evaluate import Row
 from ginn_jax.experiment import make
 from ginn_jax.lighting import find_environments
-from ginn_jax.lit_clouds import LitCloud, mean_light, split_points
 from ginn_jax.lit_experiment import UNSEEN_SEED
 from ginn_jax.lit_scenes import light_up
 from ginn_jax.mesh import find_meshes
@@ -98,7 +108,7 @@ def main(options: Options) -> dict[str, Any]:
     sources = choose_sources(options)
     runs = options.checkpoint, options.only_2d, options.only_3d
     key = jax.random.key(options.seed)
-    networks = compare.load_networks(options.effect, runs, key=key)
+    networks = load_networks(options.effect, runs, key=key)
     if not isinstance(settings, Occlusion):
         settings = replace(settings, targets=options.points // 5)
     clouds = make(console, "clouds", sources, settings, options.out / "clouds")
@@ -112,13 +122,15 @@ def main(options: Options) -> dict[str, Any]:
         shown.append((source.name, found[2]))
         networks = found[3]
     memory = {
-        name: compare.network_memory(trained, options.points * 4 // 5)
+        name: network_memory(trained, options.points * 4 // 5)
         for name, trained in networks.items()
     }
     at_points = {n: r | {"memory_mib": memory[n]} for n, r in at_points.items()}
     metrics = summary(options, at_points, rows, front_rows, [s.name for s in sources])
     compare_report.draw_methods(options.out / "ablation.png", shown[:4])
-    draw_front(options.out / "error_against_time.png", metrics["error_against_time"])
+    compare_report.draw_front(
+        options.out / "error_against_time.png", metrics["error_against_time"]
+    )
     title = TITLES[options.effect]
     report.write_results(
         options.out, metrics, compare_report.write_report(title, metrics)
@@ -149,26 +161,6 @@ def choose_sources(options: Options) -> list[Source]:
     return pair_up(objects, lights[::step], 1)
 
 
-def errors_at_points(
-    networks: dict[str, Trained],
-    clouds: list[Any],
-    sources: list[Source],
-    settings: Settings,
-) -> tuple[dict[str, Row], dict[str, Trained]]:
-    """3D errors of every network, and the networks with the limits they took."""
-    names, found = [s.name for s in sources], {}
-    for name, (network, limits, model) in networks.items():
-        given = network, limits, model, clouds, names
-        if isinstance(settings, Occlusion):
-            rows, limits = evaluate.evaluate_clouds(*given, settings.rays)
-            found[name] = evaluate.pool_rows(rows)
-        else:
-            rows, limits = evaluate_light.evaluate_lit_clouds(*given, settings)
-            found[name] = evaluate_light.pool_lit_rows(rows)
-        networks[name] = network, limits, model
-    return found, networks
-
-
 def compare_scene(
     options: Options,
     settings: Settings,
@@ -195,30 +187,19 @@ def compare_scene(
         extra = {"reference": options.reference, "size": size, "azimuth": azimuth}
         path = options.out / "references" / f"{source.name}_{size}_{view}.npz"
         origin = cloud_origin(source, settings) | extra
-        shot = compare.with_reference(
+        shot = with_reference(
             shot, settings, options.reference, path, origin, seed=source.seed
         )
-        pictures = compare.screen_pictures(shot, camera, settings, units)
+        pictures = screen_pictures(shot, camera, settings, units)
         for name, trained in networks.items():
-            picture, networks[name] = compare.network_picture(
-                name, trained, given, shot
-            )
+            picture, networks[name] = network_picture(name, trained, given, shot)
             pictures.append(picture)
         rows += [p.row | {"name": source.name, "view": view} for p in pictures]
         if view == 0:
-            shown = displayed(shot, pictures)
+            shown = compare.displayed(shot, pictures)
             front += [p.row for p in pictures]
             front += rivals(options, settings, shot, given, networks, units)
     return rows, front, shown, networks
-
-
-def points_given(cloud: Any) -> tuple[Any, np.ndarray | None]:
-    """The part of a cloud that networks are given, and the units of its light."""
-    count = len(cloud.position) * 4 // 5
-    if not isinstance(cloud, LitCloud):
-        return evaluate.split_cloud(cloud, count)[0], None
-    given = split_points(cloud, count)[0]
-    return given, mean_light(given)
 
 
 def rivals(
@@ -230,33 +211,23 @@ def rivals(
     units: np.ndarray | None,
 ) -> list[Row]:
     """Our network at other rates and radii, and tracing, plain and denoised."""
-    network, limits, model = networks[compare.OURS]
-    picture, networks[compare.OURS] = compare.network_picture(
-        "ours, scale 0.5", networks[compare.OURS], given, shot, 0.5
+    network, limits, model = networks[OURS]
+    picture, networks[OURS] = network_picture(
+        "ours, scale 0.5", networks[OURS], given, shot, 0.5
     )
     rows = [picture.row]
     for radius in options.disks:
         variant = with_disk_radius(network, radius)
         trained = variant, limits_at(network, limits, radius), model
         name = f"ours, disk {radius:g}"
-        rows.append(compare.network_picture(name, trained, given, shot)[0].row)
+        rows.append(network_picture(name, trained, given, shot)[0].row)
     for count in options.counts:
         seed = 1_000_003 + options.seed
-        noisy = compare.traced_picture(shot, settings, count, units, seed=seed)
+        noisy = traced_picture(shot, settings, count, units, seed=seed)
         rows.append(noisy.row)
-        if denoised := compare.denoised_picture(shot, noisy, units):
+        if denoised := denoised_picture(shot, noisy, units):
             rows.append(denoised.row)
     return rows
-
-
-def displayed(shot: Shot, pictures: list[Picture]) -> dict[str, np.ndarray]:
-    """What the methods show, and the reference."""
-    values = {p.row["method"]: p.values for p in pictures}
-    values["reference"] = compare.target_of(shot)
-    if isinstance(shot, evaluate.View):
-        mask = shot.gbuffer.mask
-        return {name: evaluate_light.fill(mask, v) for name, v in values.items()}
-    return {name: evaluate_light.displayed(shot, v) for name, v in values.items()}
 
 
 def summary(
@@ -267,52 +238,15 @@ def summary(
     names: list[str],
 ) -> dict[str, Any]:
     """What metrics.json holds."""
-    results = compare_report.pool_shots(rows)
-    for row in results:
-        known = at_points.get(row["method"], {})
-        row |= {k: known[k] for k in KEPT if k in known}
-    front = compare_report.pool_shots(front_rows)
-    ours = next(r for r in results if r["method"] == compare.OURS)
-    units = "" if options.effect == "ao" else UNITS
-    return {
-        "results": results,
-        "lost_cells": compare_report.lost_cells(results),
-        "error_against_time": front,
-        "front_mse": compare_report.pareto_front(front),
-        "front_dssim": compare_report.pareto_front(front, "dssim_2d"),
-        "share_2d": ours["seconds_2d"] / ours["seconds"],
-        "denoiser": any("denoised" in row for row in front),
+    return compare_report.summary(options.effect, at_points, rows, front_rows) | {
         "objects": len(names),
         "names": names,
-        "units": units or "Errors are of openness, 1 where nothing is near.",
         "rows": rows,
         "front_rows": front_rows,
         "options": {k: str(v) for k, v in asdict(options).items()},
         "environment": report.environment(),
         "peak_memory_gib": report.peak_memory_gib(),
     }
-
-
-KEPT = ("mse_3d", "relative_mse_3d", "equal_rays", "memory_mib")
-UNITS = (
-    "MSE is of the transported light, in units of the squared mean light of each scene "
-    "and channel."
-)
-
-
-def draw_front(path: Path, rows: list[Row]) -> None:
-    """Error against run time, one line a kind of method."""
-    groups = {
-        "ours": [r for r in rows if r["method"].startswith(compare.OURS)],
-        "ablations": [r for r in rows if r["method"] in ("2D only", "3D only")],
-        "screen space": [
-            r for r in rows if r["method"] in ("screen space", "visibility bitmask")
-        ],
-        "traced": [r for r in rows if "traced" in r],
-        "traced and denoised": [r for r in rows if "denoised" in r],
-    }
-    kept = {name: group for name, group in groups.items() if group}
-    report.draw_error_against_time(path, kept)
 
 
 if __name__ == "__main__":

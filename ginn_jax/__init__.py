@@ -53,7 +53,10 @@ Modules, in the order the data flows; each imports only what stands before it:
     evaluate          errors of ambient occlusion: points, images, against run time
     evaluate_light    the same for effects that carry light
     pretrained        the trained networks that come with the package
-    compare           every method on the same pixels
+    compare           shots, and the errors of the pictures that methods make of them
+    compare_networks  the networks on a shot: their pictures and memory
+    compare_screen    methods of screen space on a shot
+    compare_tracing   references of shots, and tracing as a rival
     report            metrics.json, report.md and figures of an experiment
     experiment        what every experiment does around its effect
     compare_report    lost cells, Pareto front and figures of a comparison

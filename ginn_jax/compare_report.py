@@ -10,12 +10,17 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from ginn_jax import report
-from ginn_jax.compare import OURS
+from ginn_jax.compare_networks import OURS
 from ginn_jax.evaluate import Row
 from ginn_jax.metrics import tone_map
 
 RIVALS = ("screen space", "2D only", "3D only")
 CELLS = ("mse_3d", "mse_2d", "dssim_2d")
+KEPT = ("mse_3d", "relative_mse_3d", "equal_rays", "memory_mib")
+UNITS = (
+    "MSE is of the transported light, in units of the squared mean light of each scene "
+    "and channel."
+)
 
 
 def lost_cells(rows: Sequence[Row]) -> list[str]:
@@ -52,6 +57,32 @@ def pool_shots(rows: Sequence[Row]) -> list[Row]:
         mean["relative_mse_2d"] = mean["mse_2d"] / mean["variance_2d"]
         pooled.append({"method": method, "shots": len(group)} | mean)
     return pooled
+
+
+def summary(
+    effect: str,
+    at_points: Mapping[str, Row],
+    rows: Sequence[Row],
+    front_rows: Sequence[Row],
+) -> dict[str, Any]:
+    """What all shots together say of the methods, and the errors at points."""
+    results = pool_shots(rows)
+    for row in results:
+        known = at_points.get(row["method"], {})
+        row |= {k: known[k] for k in KEPT if k in known}
+    front = pool_shots(front_rows)
+    ours = next(r for r in results if r["method"] == OURS)
+    openness = "Errors are of openness, 1 where nothing is near."
+    return {
+        "results": results,
+        "lost_cells": lost_cells(results),
+        "error_against_time": front,
+        "front_mse": pareto_front(front),
+        "front_dssim": pareto_front(front, "dssim_2d"),
+        "share_2d": ours["seconds_2d"] / ours["seconds"],
+        "denoiser": any("denoised" in row for row in front),
+        "units": openness if effect == "ao" else UNITS,
+    }
 
 
 def write_report(title: str, m: Mapping[str, Any]) -> str:
@@ -106,6 +137,21 @@ By DSSIM: {", ".join(m["front_dssim"])}.
 
 ![methods on the same pixels](ablation.png)
 """
+
+
+def draw_front(path: Path, rows: list[Row]) -> None:
+    """Error against run time, one line a kind of method."""
+    groups = {
+        "ours": [r for r in rows if r["method"].startswith(OURS)],
+        "ablations": [r for r in rows if r["method"] in ("2D only", "3D only")],
+        "screen space": [
+            r for r in rows if r["method"] in ("screen space", "visibility bitmask")
+        ],
+        "traced": [r for r in rows if "traced" in r],
+        "traced and denoised": [r for r in rows if "denoised" in r],
+    }
+    kept = {name: group for name, group in groups.items() if group}
+    report.draw_error_against_time(path, kept)
 
 
 def draw_methods(

@@ -16,6 +16,33 @@ settings.register_profile(
 settings.load_profile("ginn_jax")
 
 
+# What takes longest begins first, so that the processes end together.
+LONGEST = (
+    "pretrained",
+    "lit_experiments",
+    "relight",
+    "training_stress",
+    "capacities",
+    "train",
+    "experiments",
+    "benchmarks",
+    "geometry",
+    "limits",
+    "image",
+    "network",
+    "mcconv",
+    "hierarchy",
+    "stability",
+    "figures",
+    "compare",
+)
+
+
+def pytest_collection_modifyitems(items):
+    rank = {f"test_{name}": place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+
+
 @pytest.fixture
 def unchecked():
     """No annotation is checked: wrong input meets the library as a user's would."""

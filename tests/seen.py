@@ -1,7 +1,9 @@
 """Analytic scenes for screen-space methods: planes and boxes seen by any camera."""
 
+from functools import cache
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from ginn_jax.camera import Camera, orbit_camera, pixel_directions
@@ -47,6 +49,12 @@ def see(camera, *boxes):
         part.reshape(shape),
         camera,
     )
+
+
+@cache
+def compiled(method, camera, *options):
+    """A method under jit, for one camera and (name, value) pairs: compiled once."""
+    return jax.jit(lambda *images: method(*images, camera=camera, **dict(options)))
 
 
 FLOOR = ((-5.0, -1.0, -5.0), (5.0, 0.0, 5.0))

@@ -1,75 +1,33 @@
-"""Files that cannot be used: each refused in one line that names it and the mend.
+"""Meshes, points and maps that cannot be used.
 
 `ROWS` is the table: what is wrong, how to make it, what is called with it, and what is
-said. Nothing may be written, and nothing that was there may change.
+said.
 """
 
-import json
-import os
-import resource
-from typing import Any, NamedTuple
-
-import jax.numpy as jnp
 import numpy as np
-import pytest
-import tiny
-import trimesh
+from damaged import (
+    BOX,
+    NOISE,
+    PLY,
+    Row,
+    assert_refused,
+    directory,
+    each_row,
+    holds,
+    missing,
+    zeros,
+)
 
-from ginn_jax import checkpoint, dataset, lighting, lit_clouds, mesh
-from ginn_jax.errors import InputError
+from ginn_jax import lighting, mesh
 from ginn_jax.renderer import use_mitsuba
-from ginn_jax.train import TrainState
 
-GIGABYTE = 1 << 30
-NOISE = np.random.default_rng(0).bytes(3000)
-BOX = trimesh.creation.box()
-PLY, TEXT_PLY = (BOX.export(file_type="ply", encoding=e) for e in ("binary", "ascii"))
+TEXT_PLY = BOX.export(file_type="ply", encoding="ascii")
 STL = BOX.export(file_type="stl")
 TRIANGLE = "v {} 0 0\nv 1 0 0\nv 0 1 0\nf {} 2 3\n"
 POINTS = "ply\nformat ascii 1.0\nelement vertex {}\n" + "".join(
     f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz")
 )
 ONE_POINT = POINTS + "end_header\n0 0 0 0 1 0\n"
-STATE = TrainState(
-    {"encoder": {"kernel": jnp.ones((3, 4))}, "shader": {}},
-    (),
-    jnp.int32(3),
-    jnp.int32(0),
-)
-
-
-def holds(content, name="bad"):
-    """A file of these bytes."""
-
-    def make(folder):
-        path = folder / name
-        path.write_bytes(content.encode() if isinstance(content, str) else content)
-        return path
-
-    return make
-
-
-def zeros(name):
-    """A gigabyte of nothing."""
-
-    def make(folder):
-        with open(folder / name, "wb") as file:
-            file.truncate(GIGABYTE)
-        return folder / name
-
-    return make
-
-
-def directory(name):
-    def make(folder):
-        (folder / name).mkdir()
-        return folder / name
-
-    return make
-
-
-def missing(name):
-    return lambda folder: folder / name
 
 
 def image(name, value):
@@ -84,104 +42,12 @@ def image(name, value):
     return make
 
 
-def shard(change=lambda whole: whole, **columns):
-    """A cloud's file, its bytes or some of its columns changed."""
-
-    def make(folder):
-        cloud = tiny.sphere_on_plane(20, 0)._asdict() | columns
-        arrays = {name: a for name, a in cloud.items() if a is not None}
-        dataset.save_arrays(folder / "shard.npz", arrays, {})
-        path = folder / "shard.npz"
-        path.write_bytes(change(path.read_bytes()))
-        return path
-
-    return make
-
-
-def pickled(folder):
-    """A cloud with a column of objects, which only a pickle can hold."""
-    objects = np.array([os.getcwd], object)
-    np.savez(folder / "shard.npz", origin="{}", position=objects, allow_pickle=True)
-    return folder / "shard.npz"
-
-
-def run(record=None, text=None, damage=None):
-    """The folder of a run with this record and a checkpoint."""
-
-    def make(folder):
-        checkpoint.save_run(folder, tiny.CONFIG, tiny.LIMITS, {})
-        saved = json.loads((folder / "run.json").read_text()) | (record or {})
-        content = json.dumps(saved) if text is None else text
-        (folder / "run.json").write_text(content)
-        save_state(folder)
-        if damage is not None:
-            damage(folder)
-        return folder
-
-    return make
-
-
-def save_state(folder, state=STATE):
-    manager = checkpoint.open_manager(folder)
-    checkpoint.save_state(manager, state)
-    checkpoint.finish(manager)
-
-
-def restore(folder, like=STATE):
-    manager = checkpoint.open_manager(folder)
-    try:
-        return checkpoint.restore_state(manager, like)
-    finally:
-        manager.close()
-
-
-def restore_wider(folder):
-    wider = {"encoder": {"kernel": jnp.ones((3, 5))}, "shader": {}}
-    return restore(folder, STATE._replace(variables=wider))
-
-
-def halve_checkpoint(folder):
-    for path in (folder / "checkpoints" / "3").rglob("*"):
-        if path.is_file():
-            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-
-
-def resume(folder):
-    return checkpoint.load_run(folder, tiny.CONFIG, {})
-
-
 def huge(header):
     """A map that says it is enormous."""
     return header.encode() + NOISE
 
 
-def with_training(**change):
-    """A record whose training says something else."""
-
-    def make(folder):
-        run()(folder)
-        record = json.loads((folder / "run.json").read_text())
-        record["training"] |= change
-        (folder / "run.json").write_text(json.dumps(record))
-        return folder
-
-    return make
-
-
-class Row(NamedTuple):
-    """What is wrong, how to make it, what is called with it, what is said."""
-
-    name: str
-    make: Any
-    call: Any
-    message: str
-
-
-LIT, GREY, MAP = (
-    lit_clouds.load_lit_cloud,
-    dataset.load_cloud,
-    lighting.load_environment,
-)
+MAP = lighting.load_environment
 RGBE = "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {0} +X {0}\n"
 ROWS = [
     # Meshes
@@ -281,61 +147,9 @@ ROWS = [
     ),
     Row("HDR of -8 rows", holds(huge(RGBE.format(-8)), "a.hdr"), MAP, "cannot be read"),
     Row("enormous PFM", holds(huge("PF\n999999 999999\n-1\n"), "a.pfm"), MAP, "cannot"),
-    # Clouds on disk
-    Row("no shard", missing("a.npz"), GREY, "no such cloud"),
-    Row("half a shard", shard(lambda b: b[: len(b) // 2]), GREY, "damaged: delete it"),
-    Row("1 GB shard of nothing", zeros("a.npz"), GREY, "damaged: delete it"),
-    Row("shard with a pickle", pickled, GREY, "damaged: delete it"),
-    Row("lit: pickle", pickled, LIT, "damaged: delete it"),
-    Row("shard is a folder", directory("a.npz"), GREY, "Is a directory.*: mend that"),
-    Row("of 2D points", shard(position=np.ones((20, 2))), GREY, "another kind"),
-    Row("of unequal rows", shard(target=np.ones(19)), GREY, "another kind of cloud"),
-    Row("of words", shard(target=np.array(["a"] * 20)), GREY, "another kind of cloud"),
-    Row("without target", shard(target=None), GREY, "another kind of cloud"),
-    Row("grey as lit", shard(), LIT, "another kind of cloud: choose another"),
-    # Runs and checkpoints
-    Row("no run", directory("r"), checkpoint.load_weights, "no run: name the --out"),
-    Row("no run to resume", directory("r"), resume, "no run to resume: leave out"),
-    Row("half a record", run(text='{"training'), resume, "damaged: delete it"),
-    Row("record of nothing", run(text="\0" * 99), resume, "damaged: delete it"),
-    Row("deep record", run(text='{"a":' * 10**5), resume, "damaged: delete it"),
-    Row("record, limit inf", run({"limits": {"a": np.inf}}), resume, "damaged: delete"),
-    Row("record, limit -1", run({"limits": {"a": -1}}), resume, "damaged: delete"),
-    *(
-        Row(f"record, {n} {v}", with_training(**{n: v}), checkpoint.load_weights, "dam")
-        for n, v in (("steps", 0), ("points", "many"), ("network", {"levels": []}))
-    ),
-    Row(
-        "checkpoint of another shape",
-        run(),
-        restore_wider,
-        "not of this network: .*encoder.kernel",
-    ),
-    Row("half a checkpoint", run(damage=halve_checkpoint), restore, "3 cannot be read"),
-    Row("weights of another shape", run(), checkpoint.load_weights, "cannot be read"),
 ]
 
 
-def contents(folder):
-    """Every path below a folder, and how large it is."""
-    return {str(p): p.stat().st_size for p in folder.rglob("*") if not p.is_dir()}
-
-
-def refused(call, folder, message):
-    """The one line that a call ends in, having left the folder as it was."""
-    before = contents(folder)
-    with pytest.raises(InputError, match=message) as caught:
-        call()
-    assert str(caught.value).isprintable()
-    assert contents(folder) == before
-    return str(caught.value)
-
-
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
+@each_row(ROWS)
 def test_bad_file_is_refused_in_one_line(row, tmp_path):
-    path = row.make(tmp_path)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    said = refused(lambda: row.call(path), tmp_path, row.message)
-    assert "".join(c if c.isprintable() else " " for c in str(path)) in said
-    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - peak
-    assert grown * 1024 < GIGABYTE / 2
+    assert_refused(row, tmp_path)

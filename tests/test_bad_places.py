@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 import tiny
 import trimesh
-from test_bad_files import STATE, contents, refused, restore, save_state
+from damaged import contents, refused
+from saved import STATE, restore, save_state
 
 from experiments import ao_train, gi_train
 from ginn_jax import checkpoint, commandline, dataset, fit, lighting, mesh
@@ -204,6 +205,7 @@ def ends(monkeypatch, capsys, script, *words, main=None):
         (("--steps", "-3"), "--steps is -3: give at least 1"),
         (("--points", 10**13), "--points is 10000000000000: give at most"),
         (("--steps", "1.5"), "--steps"),
+        (("--steps", "many"), "--steps"),
         (("--seed", "-1"), "--seed is -1"),
         (("--learning-rate", "nan"), "--learning-rate is nan: give it above 0"),
         (("--resolution-scale", "0"), r"--resolution-scale is 0\.0: give it in"),

@@ -159,8 +159,9 @@ def test_stages_of_the_step(stage):
 @pytest.mark.parametrize("trained", [False, True])
 def test_poisson_radii(tmp_path, monkeypatch, trained):
     stand_in(monkeypatch)
-    variables = jax.tree.map(np.asarray, tiny.fresh_state().variables)
-    record = (tiny.CONFIG, tiny.LIMITS, variables)
+    config = replace(tiny.CONFIG, network=tiny.ONE_LEVEL)
+    variables = jax.tree.map(np.asarray, untrained(config).variables)
+    record = (config, tiny.ONE_LEVEL_LIMITS, variables)
     monkeypatch.setattr(poisson_radii, "load_weights", lambda _: record)
     (tmp_path / "run.json").write_text('{"occlusion": {"radius": 0.2}}')
     options = poisson_radii.Options(
@@ -277,7 +278,7 @@ def test_mistakes_are_input_errors(tmp_path, monkeypatch):
 
 def stand_in(monkeypatch):
     """Networks that compile in seconds, untrained, with limits that suffice at once."""
-    monkeypatch.setattr(architecture, "DEFAULT", tiny.NETWORK)
+    monkeypatch.setattr(architecture, "DEFAULT", tiny.ONE_LEVEL)
     for module in (f2d, poisson_radii, scaling, train_step):
         monkeypatch.setattr(module, "init_state", untrained)
     for module in (f2d, scaling):

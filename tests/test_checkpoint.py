@@ -10,12 +10,20 @@ import tiny
 from ginn_jax import checkpoint
 from ginn_jax.errors import InputError
 
+CONFIG = replace(tiny.CONFIG, network=tiny.ONE_LEVEL)
+LIMITS = tiny.ONE_LEVEL_LIMITS
 EXTRA = {"clouds": 12, "rays": 64}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _cheap_compiling():
+    with tiny.cheap_compiling():
+        yield
 
 
 def after(state, steps):
     for _ in range(steps):
-        state, _ = tiny.step(state, tiny.batch())
+        state, _ = tiny.step(state, tiny.batch(), CONFIG, LIMITS)
     return state
 
 
@@ -30,7 +38,7 @@ def save(folder, *states):
 def restore(folder):
     manager = checkpoint.open_manager(folder)
     try:
-        return checkpoint.restore_state(manager, tiny.fresh_state())
+        return checkpoint.restore_state(manager, tiny.fresh_state(CONFIG, LIMITS))
     finally:
         manager.close()
 
@@ -38,7 +46,7 @@ def restore(folder):
 @pytest.fixture(scope="module")
 def third():
     """The state after three steps, as NumPy."""
-    return jax.tree.map(np.array, after(tiny.fresh_state(), 3))
+    return jax.tree.map(np.array, after(tiny.fresh_state(CONFIG, LIMITS), 3))
 
 
 @pytest.fixture(scope="module")
@@ -52,11 +60,11 @@ def saved(third, tmp_path_factory):
 def test_resumed_run_equals_an_unbroken_one(third, saved):
     resumed = restore(saved)
     assert tiny.identical(jax.tree.map(np.array, resumed), third)
-    like = tiny.fresh_state()
+    like = tiny.fresh_state(CONFIG, LIMITS)
     assert jax.tree.map(lambda a: a.sharding, resumed) == jax.tree.map(
         lambda a: a.sharding, like
     )
-    resumed, unbroken = after(resumed, 3), after(tiny.fresh_state(), 6)
+    resumed, unbroken = after(resumed, 3), after(tiny.fresh_state(CONFIG, LIMITS), 6)
     assert tiny.identical(resumed, unbroken)
     assert resumed.step == 6
 
@@ -113,13 +121,13 @@ def test_checkpoint_of_another_network_is_refused(third, tmp_path):
 @pytest.fixture
 def recorded(tmp_path):
     """A folder with the record of a run."""
-    checkpoint.save_run(tmp_path, tiny.CONFIG, tiny.LIMITS, EXTRA)
+    checkpoint.save_run(tmp_path, CONFIG, LIMITS, EXTRA)
     return tmp_path
 
 
 def test_record_comes_back(recorded):
-    limits = checkpoint.load_run(recorded, tiny.CONFIG, EXTRA)
-    assert dict(limits.sizes) == dict(tiny.LIMITS.sizes)
+    limits = checkpoint.load_run(recorded, CONFIG, EXTRA)
+    assert dict(limits.sizes) == dict(LIMITS.sizes)
     assert [p.name for p in recorded.iterdir()] == ["run.json"]
 
 
@@ -132,26 +140,26 @@ def test_record_comes_back(recorded):
         {"learning_rate": 0.01},
         {"schedule": "paper"},
         {"seed": 1},
-        {"network": replace(tiny.NETWORK, hidden=8)},
-        {"network": replace(tiny.NETWORK, encoder=tiny.NETWORK.encoder[:-1])},
+        {"network": replace(tiny.ONE_LEVEL, hidden=8)},
+        {"network": tiny.NETWORK},
     ],
 )
 def test_other_configuration_is_refused(recorded, change):
     [name] = change
     with pytest.raises(InputError, match=rf"^[^\n]*run\.json[^\n]* {name}\b[^\n]*$"):
-        checkpoint.load_run(recorded, replace(tiny.CONFIG, **change), EXTRA)
+        checkpoint.load_run(recorded, replace(CONFIG, **change), EXTRA)
 
 
 @pytest.mark.parametrize("extra", [{"clouds": 13, "rays": 64}, EXTRA | {"new": 1}])
 def test_other_data_is_refused(recorded, extra):
     name = "clouds" if "new" not in extra else "new"
     with pytest.raises(InputError, match=rf"another {name}\b"):
-        checkpoint.load_run(recorded, tiny.CONFIG, extra)
+        checkpoint.load_run(recorded, CONFIG, extra)
 
 
 def test_no_record_is_refused(tmp_path):
     with pytest.raises(InputError, match="no run to resume"):
-        checkpoint.load_run(tmp_path, tiny.CONFIG, EXTRA)
+        checkpoint.load_run(tmp_path, CONFIG, EXTRA)
 
 
 @pytest.mark.parametrize(
@@ -170,23 +178,23 @@ def test_damaged_record_is_refused(recorded, damage):
     path = recorded / "run.json"
     path.write_text(damage(path.read_text()))
     with pytest.raises(InputError, match=r"^[^\n]*run\.json[^\n]*$"):
-        checkpoint.load_run(recorded, tiny.CONFIG, EXTRA)
+        checkpoint.load_run(recorded, CONFIG, EXTRA)
 
 
 def test_undecodable_record_is_refused(recorded):
     (recorded / "run.json").write_bytes(b"\xff\xfe\x00{")
     with pytest.raises(InputError, match=r"run\.json is damaged"):
-        checkpoint.load_run(recorded, tiny.CONFIG, EXTRA)
+        checkpoint.load_run(recorded, CONFIG, EXTRA)
 
 
 def test_weights_of_a_run_come_back(third, saved, tmp_path):
     """With nothing but the folder: the configuration is read as well."""
     shutil.copytree(saved, tmp_path, dirs_exist_ok=True)
-    checkpoint.save_run(tmp_path, tiny.CONFIG, tiny.LIMITS, EXTRA)
+    checkpoint.save_run(tmp_path, CONFIG, LIMITS, EXTRA)
     config, limits, variables = checkpoint.load_weights(tmp_path)
-    assert config == tiny.CONFIG
-    assert hash(config) == hash(tiny.CONFIG)
-    assert dict(limits.sizes) == dict(tiny.LIMITS.sizes)
+    assert config == CONFIG
+    assert hash(config) == hash(CONFIG)
+    assert dict(limits.sizes) == dict(LIMITS.sizes)
     assert tiny.identical(jax.tree.map(np.array, variables), third.variables)
     assert all(len(a.devices()) == 1 for a in jax.tree.leaves(variables))
 

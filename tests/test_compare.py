@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from experiments import evaluate as experiment
 from ginn_jax import checkpoint, compare_report
-from ginn_jax.compare import OURS
+from ginn_jax.compare_networks import OURS
 from ginn_jax.compare_report import (
     RIVALS,
     inset_place,
@@ -78,12 +78,19 @@ def test_inset_lies_where_the_reference_varies():
     assert column <= 25 <= column + size
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _cheap_compiling():
+    with tiny.cheap_compiling():
+        yield
+
+
 def finished_run(folder):
     """A folder as a training run leaves it, of the tiny untrained network."""
     folder.mkdir()
-    checkpoint.save_run(folder, tiny.CONFIG, tiny.LIMITS, {})
+    config = replace(tiny.CONFIG, network=tiny.ONE_LEVEL)
+    checkpoint.save_run(folder, config, tiny.ONE_LEVEL_LIMITS, {})
     manager = checkpoint.open_manager(folder, fresh=True)
-    checkpoint.save_state(manager, tiny.fresh_state())
+    checkpoint.save_state(manager, tiny.fresh_state(config, tiny.ONE_LEVEL_LIMITS))
     manager.close()
     return folder
 

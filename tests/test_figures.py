@@ -9,24 +9,30 @@ import pytest
 import tiny
 
 from experiments import animation, environment_maps, latent_features
-from ginn_jax import compare, train
+from ginn_jax import compare_networks, train
 from ginn_jax.errors import InputError
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _cheap_compiling():
+    with tiny.cheap_compiling():
+        yield
 
 
 @cache
 def untrained(effect):
     """What `load_pretrained` gives, of the tiny network before its first step."""
-    lit = replace(tiny.NETWORK, materials=1, lights=1)
-    network = tiny.NETWORK if effect == "ao" else lit
+    plain = replace(tiny.ONE_LEVEL, latent=4)
+    lit = replace(plain, materials=1, lights=1)
+    network = plain if effect == "ao" else lit
     config = replace(tiny.CONFIG, network=network)
-    with tiny.cheap_compiling():
-        variables = jax.device_get(train.init_state(config).variables)
-    return config, tiny.LIMITS, variables
+    variables = jax.device_get(train.init_state(config).variables)
+    return config, tiny.ONE_LEVEL_LIMITS, variables
 
 
 @pytest.fixture(autouse=True)
 def tiny_networks(monkeypatch):
-    for module in (compare, environment_maps, latent_features):
+    for module in (compare_networks, environment_maps, latent_features):
         monkeypatch.setattr(
             module, "load_pretrained", lambda name: untrained(name.split("_")[0])
         )

@@ -9,9 +9,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 import tiny
+from damaged import BOX
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from test_bad_files import BOX, ONE_POINT, restore, save_state
+from saved import restore, save_state
+from test_bad_files import ONE_POINT
 
 from ginn_jax import checkpoint, dataset, lighting, lit_clouds, mesh
 from ginn_jax.errors import InputError, InputWarning

@@ -1,4 +1,4 @@
-"""Levels, edges, areas and weights of a small sphere, and every limit in turn."""
+"""Levels, edges, areas and weights of a small sphere."""
 
 from functools import partial
 
@@ -7,74 +7,30 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
+import tiny
 from hypothesis import given
 from hypothesis import strategies as st
+from small_sphere import (
+    CLOUD,
+    LEVELS,
+    NETWORKS,
+    QUERIES,
+    RADIUS,
+    as_jax,
+    as_numpy,
+    generous,
+    jitted,
+)
 
 from ginn_jax import geometry as ge
-from ginn_jax.architecture import PRESETS, Network, compact_network, released_table
+from ginn_jax.architecture import Network, released_table
 from ginn_jax.packets import Demand, Edges
-from ginn_jax.receptive_field import Oriented
-
-RADIUS = 0.5
-LEVELS = (0.1, 0.25)
-NETWORKS = {
-    density: compact_network(4, LEVELS, query_radius=0.25, density=density)
-    for density in ("surface", "kde")
-}
-SHALLOW = compact_network(4, (0.25,), query_radius=0.25, density="kde")
-GENEROUS = {"points": 512, "edges": 1 << 14, "candidates": 1 << 15, "pairs": 1 << 16}
-GENEROUS |= {"columns": 1 << 12, "words": 1 << 10}
 
 
-def sphere(count, seed):
-    normal = np.random.default_rng(seed).normal(size=(count, 3))
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    normal = normal.astype(np.float32)
-    return Oriented(np.float32(RADIUS) * normal, normal, np.arange(count) < count - 20)
-
-
-CLOUD, QUERIES = sphere(340, 0), sphere(50, 1)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quick_compilation():
-    """Most of the time here is XLA's."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
-def build(config, limits, cloud, queries):
-    cloud, queries = jax.tree.map(jnp.asarray, (cloud, queries))
-    geometry, demands = ge.build_geometry(config, limits, cloud, key=jax.random.key(2))
-    ends = geometry.levels[0], geometry.grid, geometry.area, queries
-    field, more = ge.build_query_field(config, limits, *ends)
-    return geometry, field, demands | more
-
-
-@partial(jax.jit, static_argnums=(0, 1))
-def jitted(config, limits, cloud, queries):
-    return build(config, limits, cloud, queries)
-
-
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def demands_of(config, limits, stages, cloud, queries):
-    """The demands of some searches; XLA drops whatever comes after them."""
-    demands = build(config, limits, cloud, queries)[2]
-    return {n: d for n, d in demands.items() if n.startswith(stages)}
-
-
-def generous(config):
-    names = ge.limit_names(config)
-    return ge.Limits(tuple((n, GENEROUS[n.split(".")[1]]) for n in names))
-
-
-def as_numpy(tree):
-    return jax.tree.map(np.asarray, tree)
-
-
-def as_jax(demands):
-    return jax.tree.map(jnp.asarray, demands)
+@pytest.fixture(autouse=True, scope="module")
+def _cheap_compiling():
+    with tiny.cheap_compiling():
+        yield
 
 
 @pytest.fixture(scope="module", params=NETWORKS)
@@ -207,76 +163,6 @@ def test_exact_limits_give_the_same_geometry(surface):
     np.testing.assert_array_equal(tight_query.weight, query_field.weight[few])
 
 
-@pytest.fixture(scope="module")
-def shallow():
-    demands = as_numpy(demands_of(SHALLOW, generous(SHALLOW), "", CLOUD, QUERIES))
-    assert ge.fits(generous(SHALLOW), as_jax(demands))
-    return demands
-
-
-@pytest.mark.parametrize(
-    "names",
-    [
-        ("level_0.candidates",),
-        ("level_0.edges",),
-        ("level_0.points",),
-        ("conv_0.columns", "query.columns"),
-        ("level_0.words",),
-        ("conv_0.edges", "query.edges"),
-        ("conv_0.pairs", "query.pairs"),
-    ],
-)
-def test_limits_that_are_too_small_are_named(shallow, names):
-    sizes = dict(generous(SHALLOW).sizes)
-    limits = ge.Limits(tuple((sizes | {n: int(shallow[n]) - 1 for n in names}).items()))
-    # Level 0 is the first: a shortage there leaves the others a lower bound.
-    stages = "level_0" if names[0].startswith("level_0") else ""
-    demands = demands_of(SHALLOW, limits, stages, CLOUD, QUERIES)
-    assert not ge.fits(limits, demands)
-    assert ge.exceeded(limits, demands) == {name: shallow[name] for name in names}
-
-
-@pytest.mark.parametrize("start", [100, 1 << 14])
-@pytest.mark.parametrize("sizes", [(700, 1000), (1000, 700), (5, 4000)])
-def test_measured_limits_fit(start, sizes):
-    """From limits that are too small, and from generous ones."""
-    tried = []
-
-    def probe(limits, i):
-        tried.append((i, limits))
-        return as_jax(demands_by_hand(sizes[i], limits))
-
-    first = ge.uniform_limits(SHALLOW, start)
-    limits = ge.measure_limits(first, probe, 2, slack=1.0)
-    assert tried[0] == (0, first)
-    for i in range(2):
-        assert ge.exceeded(limits, probe(limits, i)) == {}
-
-
-def demands_by_hand(size, limits):
-    """Demands that, as real ones, are known only as far as limits reach."""
-    demands = {name: size + i for i, name in enumerate(dict(limits.sizes))}
-    for name in demands:
-        if name.endswith("edges"):
-            candidates = name.replace("edges", "candidates")
-            demands[name] = min(demands[name], limits.of(candidates))
-    return demands
-
-
-def test_raised_limits_hold_the_demands_and_leave_the_rest():
-    limits = ge.Limits((("a", 100), ("b", 1000), ("c", 7)))
-    raised = ge.raise_limits(limits, {"a": 300, "b": 10}, 1.5)
-    assert raised.of("a") >= 450
-    assert (raised.of("b"), raised.of("c")) == (1000, 7)
-    assert hash(raised) != hash(limits)
-
-
-@given(st.integers(0, 10**8))
-def test_rounded_capacities_hold_their_count(count):
-    size = ge.round_up(count)
-    assert count <= size <= max(count * 9 / 8, count + 64)
-
-
 @given(
     st.lists(st.tuples(st.integers(0, 6), st.integers(0, 4)), unique=True, max_size=8)
 )
@@ -297,13 +183,6 @@ def test_turned_edges_are_the_same_pairs(drawn):
     assert sorted(listed) == drawn
 
 
-def test_presets_name_each_limit_once():
-    for config in PRESETS.values():
-        names = ge.limit_names(config)
-        assert len(set(names)) == len(names)
-        assert ge.uniform_limits(config, 5).of(names[-1]) == 5
-
-
 def test_only_convolutions_between_levels_are_turned():
     config = NETWORKS["surface"]
     twins = {c.name: ge.transposed(config, c) for c in config.encoder}
@@ -318,7 +197,9 @@ def test_only_convolutions_between_levels_are_turned():
 
 @partial(jax.jit, static_argnums=(0, 1))
 def named_levels(config, limits, cloud, names):
-    return ge.build_geometry(config, limits, cloud, names, key=jax.random.key(2))[0]
+    """Levels only: XLA drops the searches that come after them."""
+    built, _ = ge.build_geometry(config, limits, cloud, names, key=jax.random.key(2))
+    return built.levels
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -332,8 +213,8 @@ def test_levels_are_of_the_same_points_however_they_are_sorted(seed):
     two = named_levels(config, whole, sorted_cloud, order)
     other = named_levels(config, whole, sorted_cloud, np.arange(340, dtype=np.int32))
 
-    def points(geometry, level):
-        place = as_numpy(geometry.levels[level])
+    def points(levels, level):
+        place = as_numpy(levels[level])
         return {tuple(p) for p in place.position[place.mask].tolist()}
 
     for level in range(len(LEVELS)):

@@ -1,6 +1,7 @@
 """Trained networks that come with the package: they load, and are the ones measured."""
 
 import json
+from functools import cache
 
 import jax
 import numpy as np
@@ -14,6 +15,17 @@ from ginn_jax.evaluate import Model
 
 MANIFEST = pretrained.load_manifest()
 FULL = [name for name in ("ao", "gi", "sss") if name in MANIFEST]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _cheap_compiling():
+    with tiny.cheap_compiling():
+        yield
+
+
+@cache
+def shipped(name):
+    return pretrained.load_pretrained(name)
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +91,7 @@ def test_weights_of_another_network_or_not_finite_are_refused(exported, tmp_path
 
 def test_every_network_of_the_manifest_loads_and_is_small():
     for name, record in MANIFEST.items():
-        config, _, weights = pretrained.load_pretrained(name)
+        config, _, weights = shipped(name)
         assert config.steps == record["steps"]
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(weights))
         assert (pretrained.FOLDER / f"{name}.npz").stat().st_size < 2e6
@@ -87,9 +99,8 @@ def test_every_network_of_the_manifest_loads_and_is_small():
 
 @pytest.mark.parametrize("name", FULL)
 def test_the_error_on_the_fixed_scene_is_the_stored_one(name):
-    config, limits, weights = pretrained.load_pretrained(name)
+    config, limits, weights = shipped(name)
     model = Model(weights, jax.random.key(0))
-    with tiny.cheap_compiling():
-        error = fixed_scene_error(effect_of(name), config.network, limits, model)
+    error = fixed_scene_error(effect_of(name), config.network, limits, model)
     stored = MANIFEST[name]["fixed_scene_relative_mse_3d"]
     assert error == pytest.approx(stored, rel=0.05)

@@ -14,15 +14,31 @@ from ginn_jax.lit_clouds import LitCloud, network_numbers
 from ginn_jax.relight import prepare_relighting, relight
 
 KEY = jax.random.key(1)
-LOCAL = replace(tiny.NETWORK, materials=3, lights=1, asks="all", local=True)
+MEDIUM = replace(tiny.ONE_LEVEL, materials=3, lights=1, asks="all")
+LOCAL = replace(MEDIUM, local=True)
+# Pooling and its way back once for what is linear, once for what is not, and where
+# nothing but f_3D can be nonlinear.
 EFFECTS = {
     "illumination": replace(tiny.NETWORK, linear=True, materials=1, lights=1),
-    "scattering": replace(tiny.NETWORK, linear=True, materials=3, lights=1, asks="all"),
+    "scattering": replace(MEDIUM, linear=True),
     "homogeneous": replace(tiny.NETWORK, materials=1, lights=1),
     "local": LOCAL,
     "only_2d": only_2d(LOCAL),
-    "only_3d": only_3d(LOCAL),
+    "only_3d": only_3d(
+        replace(tiny.NETWORK, materials=3, lights=1, asks="all", local=True)
+    ),
 }
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _cheap_compiling():
+    with tiny.cheap_compiling():
+        yield
+
+
+@pytest.fixture(autouse=True)
+def _small_blocks(monkeypatch):
+    monkeypatch.setattr(image, "BLOCK", 512)
 
 
 def limits_of(network):
@@ -48,8 +64,7 @@ def case(request):
     network = EFFECTS[request.param]
     medium = (8.0, 1.3) if network.materials == 3 else ()
     config = replace(tiny.CONFIG, network=network)
-    with tiny.cheap_compiling():
-        variables = jax.device_get(train.init_state(config).variables)
+    variables = jax.device_get(train.init_state(config).variables)
     return network, variables, lit(1000, 1, medium), lit(300, 2, medium)
 
 

@@ -22,8 +22,8 @@ METHODS = pytest.mark.parametrize(
 
 
 def bounced(method, scene, exitance, options):
-    surface = scene.surface
-    return np.asarray(method(*surface, exitance, scene.camera, **options))
+    run = seen.compiled(method, scene.camera, *options.items())
+    return np.asarray(run(*scene.surface, exitance))
 
 
 def sent(scene, part, color=COLOR):
@@ -119,7 +119,7 @@ def test_no_light_gives_none_and_background_never_counts(method, options):
     assert found[scene.part == 0].max() > 0.05
     light = np.where(scene.mask[..., None], light, np.nan)
     nonsense = np.where(scene.mask[..., None], scene.position, np.nan)
-    again = method(nonsense, *scene.surface[1:], light, camera, **options)
+    again = bounced(method, scene._replace(position=nonsense), light, options)
     np.testing.assert_array_equal(found, again)
 
 

@@ -22,10 +22,13 @@ ABOVE = orbit_camera(0.0, 89.0, 2.2, width=SIZE, height=SIZE)
 
 
 def scattered(scene, light, extinction=20.0, ior=1.0, **options):
-    medium = {"albedo": ALBEDO, "extinction": extinction, "ior": ior}
-    return np.asarray(
-        radiant_exitance(*scene.surface, light, scene.camera, **medium, **options)
-    )
+    given = {"extinction": extinction, "ior": ior} | options
+    run = seen.compiled(of_albedo, scene.camera, *given.items())
+    return np.asarray(run(*scene.surface, light))
+
+
+def of_albedo(*images, **options):
+    return radiant_exitance(*images, albedo=ALBEDO, **options)
 
 
 def even(scene, value=2.0):

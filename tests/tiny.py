@@ -95,11 +95,12 @@ def _initial_state(config, limits):
 @contextmanager
 def cheap_compiling():
     """Compilation at half the time, for what runs a few times only."""
+    before = jax.config.values["jax_disable_most_optimizations"]
     jax.config.update("jax_disable_most_optimizations", True)
     try:
         yield
     finally:
-        jax.config.update("jax_disable_most_optimizations", False)
+        jax.config.update("jax_disable_most_optimizations", before)
 
 
 def identical(a, b):

@@ -1,0 +1,155 @@
+"""Our network and its ablations in a comparison: pictures, 3D errors, memory."""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array, Key
+
+from ginn_jax import evaluate, evaluate_light
+from ginn_jax.architecture import Network
+from ginn_jax.checkpoint import load_weights
+from ginn_jax.compare import Picture, Shot, Values, relative_error, scratch_mib
+from ginn_jax.dataset import ShadedPoints
+from ginn_jax.evaluate import Model, Row, View
+from ginn_jax.evaluate_light import LitView
+from ginn_jax.geometry import Limits
+from ginn_jax.image import (
+    BLOCK,
+    encode_cloud,
+    encode_whole,
+    only,
+    shade_block,
+    shade_points,
+    within_range,
+    without,
+)
+from ginn_jax.lit_clouds import LitCloud, mean_light, network_numbers, split_points
+from ginn_jax.neighbors import bucket
+from ginn_jax.objects import Source
+from ginn_jax.pretrained import load_pretrained
+from ginn_jax.receptive_field import Oriented
+from ginn_jax.scenes import Occlusion, Settings
+
+Trained = tuple[Network, Limits, Model]
+
+OURS = "ours"
+NETWORKS = {OURS: "", "2D only": "_only_2d", "3D only": "_only_3d"}
+
+
+def load_networks(
+    effect: str, runs: Sequence[Path | None], *, key: Key[Array, ""]
+) -> dict[str, Trained]:
+    """Our network of an effect and its ablations, of finished runs or, for None, those
+    that come with the package."""
+    networks = {}
+    for (name, ending), run in zip(NETWORKS.items(), runs, strict=True):
+        config, limits, weights = (
+            load_pretrained(effect + ending) if run is None else load_weights(run)
+        )
+        networks[name] = config.network, limits, Model(weights, key)
+    return networks
+
+
+def points_given(cloud: Any) -> tuple[Any, np.ndarray | None]:
+    """The part of a cloud that networks are given, and the units of its light."""
+    count = len(cloud.position) * 4 // 5
+    if not isinstance(cloud, LitCloud):
+        return evaluate.split_cloud(cloud, count)[0], None
+    given = split_points(cloud, count)[0]
+    return given, mean_light(given)
+
+
+def errors_at_points(
+    networks: dict[str, Trained],
+    clouds: list[Any],
+    sources: list[Source],
+    settings: Settings,
+) -> tuple[dict[str, Row], dict[str, Trained]]:
+    """3D errors of every network, and the networks with the limits they took."""
+    names, found = [s.name for s in sources], {}
+    for name, (network, limits, model) in networks.items():
+        given = network, limits, model, clouds, names
+        if isinstance(settings, Occlusion):
+            rows, limits = evaluate.evaluate_clouds(*given, settings.rays)
+            found[name] = evaluate.pool_rows(rows)
+        else:
+            rows, limits = evaluate_light.evaluate_lit_clouds(*given, settings)
+            found[name] = evaluate_light.pool_lit_rows(rows)
+        networks[name] = network, limits, model
+    return found, networks
+
+
+def network_picture(
+    name: str,
+    trained: Trained,
+    cloud: ShadedPoints | LitCloud,
+    shot: Shot,
+    scale: float = 1.0,
+) -> tuple[Picture, Trained]:
+    """A network's picture, and the network with the limits that it took."""
+    network, limits, model = trained
+    given = network, limits, model, cloud, shot, scale
+    if isinstance(shot, View):
+        row, image, limits = evaluate.network_row(*given)  # type: ignore[arg-type]
+        values = image[shot.gbuffer.mask]
+    else:
+        row, values, _, limits = evaluate_light.lit_network_row(*given)  # type: ignore[arg-type]
+    row |= {"method": name} | relative_error(shot, row)
+    return Picture(row, values), (network, limits, model)
+
+
+def network_values(
+    trained: Trained, cloud: ShadedPoints | LitCloud, shot: Shot
+) -> tuple[Values, Trained]:
+    """What a network makes of the pixels, not timed."""
+    network, limits, model = trained
+    given = network, limits, model.variables
+    mask = shot.gbuffer.mask
+    pixels = shot.gbuffer.position[mask], shot.gbuffer.normal[mask]
+    if isinstance(cloud, ShadedPoints):
+        ends = cloud.position, cloud.normal
+        encoded, limits = encode_cloud(*given, *ends, key=model.key)
+        values, limits = shade_points(
+            network, limits, model.variables, encoded, *pixels
+        )
+    else:
+        assert isinstance(shot, LitView)
+        encoded, limits = evaluate_light.encode_lit(network, limits, model, cloud)
+        numbers = network_numbers(shot.pixels)
+        values, limits = shade_points(
+            network, limits, model.variables, encoded, *pixels, *numbers
+        )
+    return within_range(encoded, values), (network, limits, model)
+
+
+def network_memory(trained: Trained, points: int) -> float:
+    """Scratch memory of f_3D on so many points and of f_2D on a block on every device.
+
+    What f_3D hands to f_2D is counted, inputs and outputs are not.
+    """
+    network, limits, model = trained
+
+    def shapes(rows: int, asked: bool) -> Any:
+        place = jax.ShapeDtypeStruct((rows, 3), np.float32)
+        ends = Oriented(place, place, jax.ShapeDtypeStruct((rows,), bool))
+        widths = (network.materials, network.lights) if asked else (0, 0)
+        numbers = (
+            jax.ShapeDtypeStruct((3, rows, width), np.float32) if width else None
+            for width in widths
+        )
+        return ends, *numbers
+
+    deep = network, without(limits, network.query.name)
+    given = model.variables, *shapes(bucket(points), True), model.key
+    compiled = encode_whole.lower(*deep, *given).compile()
+    encoded, _ = jax.eval_shape(partial(encode_whole, *deep), *given)
+    kept = sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(encoded.code))
+    flat = network, only(limits, network.query.name), model.variables
+    block = shapes(BLOCK, network.asks == "all")
+    shaded = shade_block.lower(*flat, encoded, *block).compile()
+    blocks = len(jax.devices()) * scratch_mib(shaded)
+    return max(scratch_mib(compiled), blocks) + kept / 2**20

@@ -1,0 +1,92 @@
+"""References of shots, and tracing as a rival: plain and denoised."""
+
+import importlib
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from ginn_jax import evaluate, evaluate_light
+from ginn_jax.compare import Picture, Shot, Truth, Values, errors, with_truth
+from ginn_jax.dataset import load_arrays, save_arrays
+from ginn_jax.errors import InputError
+from ginn_jax.evaluate import Row, View, timed
+from ginn_jax.evaluate_light import LitView
+from ginn_jax.irradiance import ColorEstimate
+from ginn_jax.reference import Estimate
+from ginn_jax.scenes import Occlusion, Settings
+
+
+def trace(shot: Shot, settings: Settings, count: int, *, seed: int) -> Truth:
+    """Ray or path tracing of the pixels with `count` each."""
+    if isinstance(shot, View):
+        assert isinstance(settings, Occlusion)
+        return evaluate.traced(shot, settings.radius, count, seed=seed)
+    return evaluate_light.traced(shot, count, seed=seed)
+
+
+def with_reference(
+    shot: Shot, settings: Settings, count: int, path: Path, origin: Row, *, seed: int
+) -> Shot:
+    """The shot with its reference, traced once and kept at `path`."""
+    try:
+        found = load_arrays(path, origin)
+    except InputError:
+        truth = trace(shot, settings, count, seed=seed)
+        found = {"mean": truth.mean, "variance": truth.variance}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_arrays(path, found, origin)
+    kind = Estimate if isinstance(shot, View) else ColorEstimate
+    return with_truth(shot, kind(**found))
+
+
+def traced_picture(
+    shot: Shot, settings: Settings, count: int, units: Any, *, seed: int
+) -> Picture:
+    """Ray or path tracing with so many rays or paths a pixel."""
+    work = partial(trace, shot, settings, count, seed=seed)
+    truth, _, seconds = timed(work, repeats=1)
+    what = "rays" if isinstance(shot, View) else "paths"
+    row = {"method": f"{count} {what}", "traced": count, "seconds": seconds}
+    return Picture(row | errors(shot, truth.mean, units), truth.mean)
+
+
+def denoised_picture(shot: Shot, noisy: Picture, units: Any) -> Picture | None:
+    """A traced picture after Open Image Denoise, guided by albedo and normals.
+
+    None where the optional package `mitsuba_oidn` is not installed.
+    """
+    try:
+        denoise = importlib.import_module("mitsuba_oidn").denoise
+    except ImportError:
+        return None
+    gbuffer = shot.gbuffer
+    mask, (color, albedo) = gbuffer.mask, denoiser_inputs(shot, noisy.values)
+    guides = {"albedo": albedo, "normal": gbuffer.normal.astype(np.float32)}
+    hdr = isinstance(shot, LitView)
+    work = partial(denoise, color, **guides, hdr=hdr, clean_aux=True)
+    image, _, seconds = timed(work)
+    image = np.asarray(image)
+    values = (image[..., 0] if isinstance(shot, View) else image)[mask]
+    row = {
+        "method": f"{noisy.row['method']}, denoised",
+        "denoised": noisy.row["traced"],
+        "seconds": noisy.row["seconds"] + seconds,
+    }
+    return Picture(row | errors(shot, values, units), values)
+
+
+def denoiser_inputs(
+    shot: Shot, values: Values
+) -> tuple[Float[np.ndarray, "H W 3"], Float[np.ndarray, "H W 3"]]:
+    """Noisy image and albedo, in colour; the transported light, as the networks' is."""
+    mask = shot.gbuffer.mask
+    if isinstance(shot, View):
+        gray = evaluate.fill(mask, values)
+        color = np.repeat(gray[..., None], 3, axis=2)
+        return color, evaluate_light.fill(mask, np.ones((len(values), 3), np.float32))
+    albedo = shot.pixels.albedo[shot.pixels.material].astype(np.float32)
+    color = evaluate_light.fill(mask, values)
+    return color, evaluate_light.fill(mask, albedo)

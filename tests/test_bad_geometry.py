@@ -1,0 +1,140 @@
+"""Points, meshes, cameras and counts of rays that cannot be meant.
+
+Each refused in one line that names the argument.
+"""
+
+import numpy as np
+from refusals import (
+    BOX,
+    INF,
+    KEY,
+    NAN,
+    POINTS,
+    RAGGED,
+    UP,
+    WORDS,
+    Table,
+    assert_refused,
+    each_row,
+)
+
+from ginn_jax import camera, hierarchy, mesh, neighbors, reference, shapes
+
+CLOUD = mesh.Samples(POINTS, UP, np.zeros(20, np.int32))
+ORIGIN, TARGET = (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
+
+
+def disk(points, radius):
+    return hierarchy.poisson_disk(points, radius, key=KEY)
+
+
+def sample(shape=BOX, count=5, seed=0):
+    return mesh.sample_surface(shape, count, seed=seed)
+
+
+def ground(cloud=CLOUD, half_extent=0.8, seed=0):
+    return mesh.add_ground_samples(cloud, half_extent, seed=seed)
+
+
+def occlusion(**change):
+    given = {"mesh": BOX, "points": POINTS, "normals": UP, "radius": 0.1}
+    return reference.ambient_occlusion(**(given | {"rays": 4, "seed": 0} | change))
+
+
+def view(**change):
+    return camera.Camera(**({"origin": ORIGIN, "target": TARGET} | change))
+
+
+TABLE: Table = {
+    neighbors.find_neighbors: [
+        ((POINTS[:, :2], POINTS, 0.1), r"points has shape \(20, 2\): give"),
+        ((POINTS, POINTS[0], 0.1), r"queries has shape \(3,\): give"),
+        ((WORDS, POINTS, 0.1), "points holds <U1: give real numbers"),
+        ((POINTS * 1j, POINTS, 0.1), "points holds complex64: give real"),
+        ((np.full((4, 3), None), POINTS, 0.1), "points holds object: give real"),
+        ((RAGGED, POINTS, 0.1), "points has rows of unequal length"),
+        ((POINTS, POINTS * NAN, 0.1), "queries holds non-finite .*: remove"),
+        ((POINTS * np.float32(1e20), POINTS, 0.1), r"points .* beyond 1e\+18: scale"),
+        ((POINTS, POINTS, -1.0), "radius is -1.0: give a number above 0"),
+        ((POINTS, POINTS, NAN), "radius is nan: give"),
+        ((POINTS, POINTS, 1e300), r"radius is 1e\+300: give"),
+        ((POINTS, POINTS, 1e-30), "radius is 1e-30: give"),
+        ((POINTS, POINTS, "wide"), "radius holds <U4: give real numbers"),
+    ],
+    disk: [
+        ((POINTS, 0.0), "radius is 0.0: give"),
+        ((POINTS, np.ones(3)), r"radius is \[1. 1. 1.\]: give"),
+        ((POINTS[:, :2], 0.1), "points has shape"),
+        ((POINTS * INF, 0.1), "points holds non-finite"),
+    ],
+    mesh.make_mesh: [
+        ((WORDS, [[0, 1, 2]]), "vertices holds <U1: give real numbers"),
+        ((RAGGED, [[0, 1, 2]]), "vertices has rows of unequal length"),
+        ((np.eye(3), [[0, 1, 2]], [-1]), r"a material is outside 0..255; mend"),
+        ((np.eye(3), [[0, 1, 2]], [NAN]), r"a material is outside 0..255; mend"),
+        ((np.eye(3), [[0, 1, 2]], ["red"]), "material holds <U3"),
+    ],
+    mesh.fit_unit_box: [
+        ((BOX._replace(vertices=BOX.vertices * NAN),), "object: empty or not finite"),
+        ((BOX._replace(vertices=BOX.vertices * 0),), "object: all points coincide"),
+    ],
+    mesh.add_ground: [
+        ((BOX, -1.0), "half_extent -1.0 must be positive"),
+        ((BOX, NAN), "half_extent nan must be positive"),
+    ],
+    sample: [
+        ((BOX, -1), "count -1 must be from 0"),
+        ((BOX, 1.5), "count 1.5 must be .* a whole number"),
+        ((BOX, NAN), "count nan must be"),
+        ((BOX, 10**13), "count 10000000000000 must be"),
+        ((BOX._replace(faces=BOX.faces[:0]), 5), "mesh: empty; give vertices"),
+        ((BOX._replace(faces=BOX.faces + 9), 5), r"face index is outside 0\.\.7"),
+        ((BOX._replace(vertices=BOX.vertices * NAN), 5), "8 vertices are not finite"),
+        ((BOX._replace(vertices=BOX.vertices * 0), 5), "all faces have zero area"),
+        (("chair.obj", 5), "mesh is a str: give what load_mesh"),
+        ({"seed": -1}, "seed -1 must be from 0"),
+    ],
+    ground: [
+        ((CLOUD, -1.0), "half_extent -1.0 must be positive"),
+        ((CLOUD, 1e9), "half_extent 1000000000.0 takes .* points: lower"),
+        ((CLOUD._replace(position=POINTS * NAN),), "points holds non-finite"),
+        ((CLOUD._replace(position=POINTS[:, :2]),), r"must both be \[N, 3\]"),
+        ((CLOUD._replace(normal=UP * 0),), "normals are .* not of unit length"),
+    ],
+    occlusion: [
+        ({"radius": -1.0}, "radius -1.0 must be positive"),
+        ({"radius": NAN}, "radius nan must be positive"),
+        ({"rays": 1.5}, "rays 1.5 must be from 1"),
+        ({"rays": 2**40}, "rays 1099511627776 must be from 1"),
+        ({"seed": 0.5}, "seed 0.5 must be"),
+        ({"points": WORDS}, "points holds <U1: give real numbers"),
+        ({"normals": UP * 2}, "normals are .* not of unit length: divide"),
+        ({"mesh": None}, "mesh is a NoneType: give"),
+        ({"mesh": BOX._replace(vertices=BOX.vertices[:, :2])}, "mesh: wrong shape"),
+        ({"mesh": BOX._replace(faces=BOX.faces + 0.5)}, "mesh: wrong shape"),
+        ({"mesh": BOX._replace(material=BOX.material[:1])}, "one material a face"),
+    ],
+    view: [
+        ({"width": 0}, "camera's width 0 must be from 1"),
+        (
+            {"width": 10**6, "height": 10**6},
+            "camera's height 1000000 must be",
+        ),
+        ({"height": 1.5}, "camera's height 1.5 must be .* whole"),
+        ({"vertical_fov": NAN}, "camera's vertical_fov nan must be a number"),
+        ({"origin": (0.0, 1.0)}, r"camera's origin \(0.0, 1.0\) must be three"),
+        ({"origin": "abc"}, "camera's origin holds <U3: give real numbers"),
+        ({"up": (0.0, 0.0, 1.0)}, "camera looks along its up"),
+    ],
+    camera.orbit_camera: [
+        ({"azimuth": INF}, "azimuth inf must be a number"),
+        ({"elevation": 90.0}, "elevation 90.0 looks along up: stay inside"),
+        ({"distance": -1.0}, "distance -1.0 must be positive"),
+    ],
+    shapes.random_shape: [((-1,), "seed -1 must be"), ((1.5,), "seed 1.5 must be")],
+}
+
+
+@each_row(TABLE)
+def test_bad_argument_is_refused_in_one_line(row, unchecked):
+    assert_refused(row)

@@ -1,0 +1,120 @@
+"""Lights, media and counts of paths that cannot be meant.
+
+Each refused in one line that names the argument.
+"""
+
+from functools import cache
+
+import numpy as np
+from refusals import BOX, INF, NAN, POINTS, UP, Table, assert_refused, each_row
+
+from ginn_jax import irradiance, lighting, lit_scenes, objects, slab, subsurface
+
+SKY = lighting.constant_sky()
+LAMP = lighting.PointLight(np.ones(3), np.ones(3))
+GREY = np.full((2, 3), 0.5)
+MEDIUM = subsurface.Medium(np.full(3, 0.5), 1.0, 1.3)
+
+
+def lit(albedo=GREY, light=SKY, **change):
+    return irradiance.light_scene(BOX._replace(**change), albedo, light)
+
+
+@cache
+def scene():
+    return lit()
+
+
+def direct(**change):
+    given = {"points": POINTS, "normals": UP, "samples": 2, "seed": 0} | change
+    return irradiance.direct_irradiance(scene(), **given)
+
+
+def indirect(**change):
+    given = {"points": POINTS, "normals": UP, "paths": 2, "seed": 0} | change
+    return irradiance.indirect_irradiance(scene(), **given)
+
+
+def exitance(paths=1, **change):
+    medium = MEDIUM._replace(**change)
+    return subsurface.subsurface_exitance(
+        scene(), medium, POINTS, UP, paths=paths, seed=0
+    )
+
+
+TABLE: Table = {
+    lighting.constant_sky: [
+        ((-1.0,), "radiance -1.0 must be a number from 0"),
+        ((NAN,), "radiance nan must be"),
+        ((1e39,), r"radiance 1e\+39 must be"),
+    ],
+    lighting.sun_and_sky: [
+        ((0.5, np.array([0, 1, 0.0])), "turbidity 0.5 must be a number from 1 to 10"),
+        ((NAN, np.array([0, 1, 0.0])), "turbidity nan must be"),
+        ((3.0, np.zeros(3)), "direction .* below the horizon or zero: lift"),
+        ((3.0, np.array([0, -1, 0.0])), "direction .* below the horizon"),
+        ((3.0, np.array([0, 1.0])), "direction .* must be three finite numbers"),
+        ((3.0, np.array([0, 1, 0.0]), -1.0), "sun_scale -1.0 must be"),
+        ((3.0, np.array([0, 1, 0.0]), INF), "sun_scale inf must be"),
+    ],
+    lighting.make_environment: [
+        ((np.full((2, 4, 3), "a"),), "radiance holds <U1"),
+        ((np.full((2, 4, 3), 1e39),), "radiance is not finite"),
+        ((np.ones((2, 4)),), r"map is \[H W 3\], this is \(2, 4\)"),
+    ],
+    lighting.studio: [((-1,), "seed -1 must be"), ((1.5,), "seed 1.5 must be")],
+    lighting.procedural_environment: [((-1,), "seed -1 must be")],
+    lighting.turned: [((SKY, NAN), "share nan must be")],
+    lit: [
+        ({"albedo": GREY * 3}, "an albedo above 1 would make light"),
+        ({"albedo": -GREY}, "albedo .* not negative"),
+        ({"albedo": np.full((2, 3), "a")}, "albedo holds <U1"),
+        ({"light": None}, "light is a NoneType: give an EnvironmentMap or"),
+        ({"light": lighting.EnvironmentMap(np.ones((0, 0, 3)))}, "this is .0, 0, 3"),
+        ({"light": lighting.EnvironmentMap(np.full((4, 8, 3), NAN))}, "not finite"),
+        ({"light": lighting.EnvironmentMap(-np.ones((4, 8, 3)))}, "negative; clip"),
+        ({"light": LAMP._replace(position=np.full(3, NAN))}, "light's position .nan"),
+        ({"light": LAMP._replace(intensity=-np.ones(3))}, "light's intensity .* neg"),
+        ({"light": LAMP._replace(position=np.ones(2))}, "light's position .* three"),
+        ({"vertices": BOX.vertices * NAN}, "8 vertices are not finite"),
+        ({"material": BOX.material - 1}, r"a material is outside 0\.\.255"),
+    ],
+    direct: [
+        ({"samples": 0}, "samples 0 must be from 1"),
+        ({"samples": 1.5}, "samples 1.5 must be"),
+        ({"seed": -1}, "seed -1 must be"),
+    ],
+    indirect: [
+        ({"paths": -4}, "paths -4 must be from 1"),
+        ({"paths": NAN}, "paths nan must be"),
+        ({"points": POINTS * INF}, "points holds non-finite"),
+    ],
+    exitance: [
+        ({"albedo": np.full(3, 1.5)}, r"albedo .* must be three numbers in \[0, 1\]"),
+        ({"albedo": np.array(["a"] * 3)}, "albedo holds <U1"),
+        ({"extinction": -1.0}, "extinction -1.0 must be a number from 0"),
+        ({"extinction": np.ones(3)}, "extinction .* must be a number"),
+        ({"ior": 0.9}, "index of refraction 0.9 must be a number from 1 to 2"),
+        ({"ior": NAN}, "index of refraction nan must be"),
+        ({"paths": -1}, "paths -1 must be from 1"),
+    ],
+    slab.single_scattering_albedo: [
+        ((np.full(3, 0.5), 0.5), "index of refraction 0.5 must be"),
+        ((np.full(3, NAN), 1.3), "albedo .* is not finite"),
+    ],
+    lit_scenes.Illumination: [({"targets": 0}, "targets 0 must be from 1 to 20000")],
+    lit_scenes.Scattering: [
+        ({"size": NAN}, "size nan must be positive"),
+        ({"absorption": 0.0}, "absorption 0.0 must be positive"),
+        ({"targets": 30_000}, "targets 30000 must be from 1 to 20000"),
+    ],
+    objects.pair_up: [
+        (([], [], 1), "no lights: give environment maps"),
+        (([], objects.point_lights(2, 0), 0), "lights for each object 0 must be"),
+    ],
+}
+
+
+@each_row(TABLE)
+def test_bad_argument_is_refused_in_one_line(row, unchecked):
+    assert_refused(row)

@@ -1,0 +1,121 @@
+"""Networks, trainings and what is given to them, or measured, that cannot be meant.
+
+Each refused in one line that names the argument.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import tiny
+from refusals import INF, KEY, NAN, POINTS, UP, WORDS, Table, assert_refused, each_row
+
+from ginn_jax import architecture, image, metrics
+from ginn_jax.geometry import uniform_limits
+
+PICTURE = np.ones((12, 12))
+FRAME = {"position": POINTS.reshape(4, 5, 3), "normal": UP.reshape(4, 5, 3)}
+
+
+def encode(network=tiny.NETWORK, limits=tiny.LIMITS, **change):
+    """Nothing is computed: what is wrong is said before."""
+    given = {"position": POINTS, "normal": UP, "key": KEY} | change
+    return image.encode_cloud(network, limits, {}, **given)
+
+
+def shade(network=tiny.NETWORK, **change):
+    given = {"position": POINTS, "normal": UP} | change
+    return image.shade_points(network, tiny.LIMITS, {}, None, **given)
+
+
+def frame(**change):
+    given = FRAME | {"mask": np.ones((4, 5), bool)} | change
+    return image.shade_image(tiny.NETWORK, tiny.LIMITS, {}, None, **given)
+
+
+def training(**change):
+    return replace(tiny.CONFIG, **change)
+
+
+def network(**change):
+    return replace(tiny.NETWORK, **change)
+
+
+def conv(**change):
+    return replace(tiny.NETWORK.query, **change)
+
+
+LIT = replace(tiny.NETWORK, lights=1)
+OTHER = uniform_limits(architecture.RELEASED, 64)
+
+TABLE: Table = {
+    encode: [
+        ({"position": POINTS[:0]}, "the cloud is empty: sample"),
+        ({"position": POINTS[:, :2]}, r"the cloud \(20, 2\) .* must both be"),
+        ({"normal": UP[:5]}, r"normals \(5, 3\) must both be \[N, 3\]"),
+        ({"position": WORDS}, "the cloud holds <U1: give real numbers"),
+        ({"position": POINTS * NAN}, "the cloud holds non-finite"),
+        ({"normal": UP * 0}, "normals are .* not of unit length"),
+        ({"light": np.ones((3, 20, 1))}, "the network takes no light: leave it out"),
+        ({"network": LIT}, r"light is \(0,\), the network takes \[C 20 1\]"),
+        ({"network": LIT, "light": np.ones((3, 5, 1))}, "light is .3, 5, 1., the net"),
+        ({"network": LIT, "light": np.full((3, 20, 1), NAN)}, "light holds non-finite"),
+        ({"limits": OTHER}, "the limits lack .*: they are of another network"),
+    ],
+    shade: [
+        ({"position": POINTS[:, :2]}, r"points \(20, 2\) .* must both be"),
+        ({"position": POINTS[:5]}, r"points \(5, 3\) and normals \(20, 3\)"),
+        ({"position": POINTS * NAN}, "points holds non-finite"),
+        ({"normal": UP * 3}, "normals are .* not of unit length"),
+        ({"network": replace(LIT, asks="all")}, "light is .*, the network takes"),
+    ],
+    frame: [
+        ({"mask": np.ones((4, 5), int)}, r"mask is int64 \(4, 5\): give bool"),
+        ({"mask": np.ones((2, 5), bool)}, r"do not fit the mask \(2, 5\)"),
+        ({"normal": UP}, r"normal \(20, 3\) do not fit the mask"),
+        ({"background": NAN}, "background nan must be"),
+        ({"resolution_scale": 0.0}, r"resolution scale 0.0: give it in \(0, 1\]"),
+        ({"resolution_scale": NAN}, "resolution scale nan: give"),
+    ],
+    metrics.mse: [
+        ((WORDS, WORDS), "holds <U1: give real numbers"),
+        ((PICTURE * 1j, PICTURE), "holds complex128"),
+        ((PICTURE, PICTURE[:3]), "shapes .* differ"),
+        ((PICTURE, PICTURE, np.ones((12, 12), int)), "mask int64.* does not fit"),
+        ((PICTURE * NAN, PICTURE), "values to compare are not finite"),
+    ],
+    metrics.equal_rays: [((1.0, INF), "equal rays of MSE 1.0, variance inf")],
+    metrics.tone_map: [((PICTURE, PICTURE * NAN), "not finite")],
+    architecture.compact_network: [
+        ({"k": 0}, "channels of conv_0 0 must be from 1"),
+        ({"levels": (-1.0, 0.1)}, "level.* must be positive|radius .* positive"),
+        ({"levels": (0.1, 0.05)}, r"levels \(0.1, 0.05\): give at least one, finest"),
+        ({"query_radius": NAN}, "radius of query nan must be positive"),
+        ({"latent": 0}, "channels of query 0 must be from 1"),
+        ({"hidden": -1}, "hidden -1 must be from 1"),
+        ({"norm": "none at all"}, "norm is 'none at all': give one of batch, layer"),
+        ({"materials": 1.5}, "materials 1.5 must be"),
+    ],
+    network: [
+        ({"encoder": (conv(skip="gone", target=0),)}, "skip of query is 'gone': give"),
+        ({"encoder": (conv(target=7),)}, "target of query 7 must be from 0 to 1"),
+        ({"query": conv(source=-2)}, "source of query -2 must be from 0 to 1"),
+    ],
+    conv: [
+        ({"bandwidth": 0.0}, "bandwidth of query 0.0 must be positive"),
+        ({"before": "after"}, "before of query is 'after': give one of raw"),
+    ],
+    training: [
+        ({"steps": 0}, "steps 0 must be from 1"),
+        ({"batch_size": -2}, "batch_size -2 must be from 1"),
+        ({"points": 1.5}, "points 1.5 must be"),
+        ({"learning_rate": NAN}, "learning_rate nan must be positive"),
+        ({"clip_norm": 0.0}, "clip_norm 0.0 must be positive"),
+        ({"schedule": "none"}, "schedule is 'none': give one of cosine, paper"),
+        ({"seed": -1}, "seed -1 must be from 0"),
+    ],
+}
+
+
+@each_row(TABLE)
+def test_bad_argument_is_refused_in_one_line(row, unchecked):
+    assert_refused(row)

@@ -1,0 +1,101 @@
+"""Limits of a network on a cloud: every one in turn too small, measured, raised."""
+
+import pytest
+import tiny
+from hypothesis import given
+from hypothesis import strategies as st
+from small_sphere import (
+    CLOUD,
+    QUERIES,
+    SHALLOW,
+    as_jax,
+    as_numpy,
+    demands_of,
+    generous,
+)
+
+from ginn_jax import geometry as ge
+from ginn_jax.architecture import PRESETS
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _cheap_compiling():
+    with tiny.cheap_compiling():
+        yield
+
+
+@pytest.fixture(scope="module")
+def shallow():
+    demands = as_numpy(demands_of(SHALLOW, generous(SHALLOW), "", CLOUD, QUERIES))
+    assert ge.fits(generous(SHALLOW), as_jax(demands))
+    return demands
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("level_0.candidates",),
+        ("level_0.edges",),
+        ("level_0.points",),
+        ("conv_0.columns", "query.columns"),
+        ("level_0.words",),
+        ("conv_0.edges", "query.edges"),
+        ("conv_0.pairs", "query.pairs"),
+    ],
+)
+def test_limits_that_are_too_small_are_named(shallow, names):
+    sizes = dict(generous(SHALLOW).sizes)
+    limits = ge.Limits(tuple((sizes | {n: int(shallow[n]) - 1 for n in names}).items()))
+    # Level 0 is the first: a shortage there leaves the others a lower bound.
+    stages = "level_0" if names[0].startswith("level_0") else ""
+    demands = demands_of(SHALLOW, limits, stages, CLOUD, QUERIES)
+    assert not ge.fits(limits, demands)
+    assert ge.exceeded(limits, demands) == {name: shallow[name] for name in names}
+
+
+@pytest.mark.parametrize("start", [100, 1 << 14])
+@pytest.mark.parametrize("sizes", [(700, 1000), (1000, 700), (5, 4000)])
+def test_measured_limits_fit(start, sizes):
+    """From limits that are too small, and from generous ones."""
+    tried = []
+
+    def probe(limits, i):
+        tried.append((i, limits))
+        return as_jax(demands_by_hand(sizes[i], limits))
+
+    first = ge.uniform_limits(SHALLOW, start)
+    limits = ge.measure_limits(first, probe, 2, slack=1.0)
+    assert tried[0] == (0, first)
+    for i in range(2):
+        assert ge.exceeded(limits, probe(limits, i)) == {}
+
+
+def demands_by_hand(size, limits):
+    """Demands that, as real ones, are known only as far as limits reach."""
+    demands = {name: size + i for i, name in enumerate(dict(limits.sizes))}
+    for name in demands:
+        if name.endswith("edges"):
+            candidates = name.replace("edges", "candidates")
+            demands[name] = min(demands[name], limits.of(candidates))
+    return demands
+
+
+def test_raised_limits_hold_the_demands_and_leave_the_rest():
+    limits = ge.Limits((("a", 100), ("b", 1000), ("c", 7)))
+    raised = ge.raise_limits(limits, {"a": 300, "b": 10}, 1.5)
+    assert raised.of("a") >= 450
+    assert (raised.of("b"), raised.of("c")) == (1000, 7)
+    assert hash(raised) != hash(limits)
+
+
+@given(st.integers(0, 10**8))
+def test_rounded_capacities_hold_their_count(count):
+    size = ge.round_up(count)
+    assert count <= size <= max(count * 9 / 8, count + 64)
+
+
+def test_presets_name_each_limit_once():
+    for config in PRESETS.values():
+        names = ge.limit_names(config)
+        assert len(set(names)) == len(names)
+        assert ge.uniform_limits(config, 5).of(names[-1]) == 5
