@@ -24,7 +24,8 @@ from ginn_jax import image, lit_scenes, objects, reference, report
 from ginn_jax.architecture import Network, compact_network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
-from ginn_jax.geometry import Limits, uniform_limits
+from ginn_jax.geometry import uniform_limits
+from ginn_jax.limits import Limits
 from ginn_jax.mesh import find_meshes
 from ginn_jax.neighbors import bucket
 from ginn_jax.network import Variables

@@ -28,14 +28,7 @@ from ginn_jax.dataset import ShadedPoints
 from ginn_jax.disk_radius import with_disk_radius
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import View, image_errors, reference_view
-from ginn_jax.geometry import (
-    Demands,
-    Limits,
-    build_geometry,
-    build_query_field,
-    limit_names,
-    measure_limits,
-)
+from ginn_jax.geometry import build_geometry, build_query_field, limit_names
 from ginn_jax.image import (
     BLOCK,
     as_openness,
@@ -43,6 +36,7 @@ from ginn_jax.image import (
     shade_image,
     shade_points,
 )
+from ginn_jax.limits import Demands, Limits, measure_limits
 from ginn_jax.mesh import Samples, find_meshes
 from ginn_jax.metrics import mse
 from ginn_jax.neighbors import bucket, pad_rows

@@ -24,7 +24,8 @@ from ginn_jax.commandline import require, start
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model
 from ginn_jax.evaluate_light import encode_lit
-from ginn_jax.geometry import Limits, uniform_limits
+from ginn_jax.geometry import uniform_limits
+from ginn_jax.limits import Limits
 from ginn_jax.lit_clouds import LitCloud, network_numbers
 from ginn_jax.mesh import Samples
 from ginn_jax.relight import prepare_relighting, relight
@@ -142,9 +143,9 @@ def from_scratch(
     def shade(limits: Limits) -> tuple[np.ndarray, Limits]:
         encoded, limits = encode_lit(network, limits, model, cloud)
         channels = 3 if encoded.scale is None else encoded.scale.size
-        numbers = (a[:channels] for a in network_numbers(pixels))
+        material, lit = (a[:channels] for a in network_numbers(pixels))
         ends = model.variables, encoded, pixels.position, pixels.normal
-        return image.shade_points(network, limits, *ends, *numbers)
+        return image.shade_points(network, limits, *ends, material, lit)
 
     limits = shade(limits)[1]
     return lambda: shade(limits)[0], limits

@@ -18,7 +18,8 @@ from benchmarks.stability_stages import (
 )
 from ginn_jax import geometry, image, shading, train
 from ginn_jax.dataset import ShadedPoints, stack_clouds
-from ginn_jax.geometry import Limits, exceeded, limit_names, raise_limits
+from ginn_jax.geometry import limit_names
+from ginn_jax.limits import Limits, exceeded, raise_limits
 from ginn_jax.receptive_field import (
     Oriented,
 )

@@ -25,7 +25,7 @@ from ginn_jax import architecture, fit, objects, report, scenes
 from ginn_jax.commandline import require, start
 from ginn_jax.dataset import ShadedPoints
 from ginn_jax.errors import InputError
-from ginn_jax.geometry import Limits
+from ginn_jax.limits import Limits
 from ginn_jax.network import Variables
 from ginn_jax.process import ALONE, available_cores
 from ginn_jax.train import (

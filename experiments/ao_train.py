@@ -27,7 +27,7 @@ from ginn_jax.experiment import (
     train,
     training,
 )
-from ginn_jax.geometry import Limits
+from ginn_jax.limits import Limits
 from ginn_jax.mesh import find_meshes
 from ginn_jax.train import Training
 

@@ -19,7 +19,7 @@ from ginn_jax.checkpoint import load_weights
 from ginn_jax.commandline import start
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model
-from ginn_jax.geometry import Limits
+from ginn_jax.limits import Limits
 from ginn_jax.lit_scenes import lit_cloud
 from ginn_jax.objects import (
     load_object,

@@ -16,7 +16,6 @@ from ginn_jax.compare import Picture, Shot, Values, relative_error, scratch_mib
 from ginn_jax.dataset import ShadedPoints
 from ginn_jax.evaluate import Model, Row, View
 from ginn_jax.evaluate_light import LitView
-from ginn_jax.geometry import Limits
 from ginn_jax.image import (
     BLOCK,
     encode_cloud,
@@ -27,6 +26,7 @@ from ginn_jax.image import (
     within_range,
     without,
 )
+from ginn_jax.limits import Limits
 from ginn_jax.lit_clouds import LitCloud, mean_light, network_numbers, split_points
 from ginn_jax.neighbors import bucket
 from ginn_jax.objects import Source
@@ -150,6 +150,6 @@ def network_memory(trained: Trained, points: int) -> float:
     kept = sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(encoded.code))
     flat = network, only(limits, network.query.name), model.variables
     block = shapes(BLOCK, network.asks == "all")
-    shaded = shade_block.lower(*flat, encoded, *block).compile()
+    shaded = shade_block.lower(*flat, encoded, *block, coherent=True).compile()
     blocks = len(jax.devices()) * scratch_mib(shaded)
     return max(scratch_mib(compiled), blocks) + kept / 2**20

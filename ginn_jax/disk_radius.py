@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from ginn_jax.architecture import Network
 from ginn_jax.errors import InputError
-from ginn_jax.geometry import Limits, limits_for
+from ginn_jax.limits import Limits, limits_for
 
 
 def with_disk_radius(network: Network, radius: float) -> Network:

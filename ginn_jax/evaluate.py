@@ -11,8 +11,8 @@ from jaxtyping import Array, Bool, Float, Key
 from ginn_jax.architecture import Network
 from ginn_jax.camera import Camera, orbit_camera
 from ginn_jax.dataset import ShadedPoints
-from ginn_jax.geometry import Limits
 from ginn_jax.image import as_openness, encode_cloud, shade_image, shade_points
+from ginn_jax.limits import Limits
 from ginn_jax.mesh import Mesh
 from ginn_jax.metrics import dssim, equal_rays, mse, tone_map
 from ginn_jax.network import Variables

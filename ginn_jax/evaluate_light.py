@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float
 from ginn_jax.architecture import Network
 from ginn_jax.camera import Camera, orbit_camera
 from ginn_jax.evaluate import Model, Row, timed
-from ginn_jax.geometry import Limits
 from ginn_jax.image import Encoded, encode_cloud, shade_image, shade_points
 from ginn_jax.irradiance import ColorEstimate
+from ginn_jax.limits import Limits
 from ginn_jax.lit_clouds import LitCloud, network_numbers, split_points
 from ginn_jax.lit_scenes import (
     Illumination,

@@ -19,13 +19,8 @@ from ginn_jax.dataset import (
     side_by_side,
     unit_light,
 )
-from ginn_jax.geometry import (
-    Demands,
-    Geometry,
-    Limits,
-    build_geometry,
-    build_query_field,
-)
+from ginn_jax.geometry import Geometry, build_geometry, build_query_field
+from ginn_jax.limits import Demands, Limits
 from ginn_jax.receptive_field import Field, Oriented
 from ginn_jax.voxels import compact, morton_order
 

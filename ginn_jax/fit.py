@@ -21,13 +21,8 @@ from ginn_jax.checkpoint import (
 from ginn_jax.dataset import ShadedPoints, batch_order, stack_clouds
 from ginn_jax.errors import InputError
 from ginn_jax.files import writing
-from ginn_jax.geometry import (
-    Limits,
-    exceeded,
-    measure_limits,
-    raise_limits,
-    uniform_limits,
-)
+from ginn_jax.geometry import uniform_limits
+from ginn_jax.limits import Limits, exceeded, measure_limits, raise_limits
 from ginn_jax.lit_clouds import Cloud, channel_of
 from ginn_jax.train import (
     Training,

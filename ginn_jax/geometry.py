@@ -1,22 +1,19 @@
 """Everything about a cloud that no parameter enters: levels, edges, weights.
 
-Every search has capacities, collected in one `Limits`; every search reports its true
-demand under the same name, so a caller can tell which limit to raise.
+Every search has capacities, collected in one `Limits`, and reports its demand under the
+same name.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Int, Key
+from jaxtyping import Array, Int, Key
 
 from ginn_jax.architecture import Conv, Network
-from ginn_jax.checks import LARGEST_INDEX
-from ginn_jax.errors import InputError
 from ginn_jax.hierarchy import Level, LevelLimit, build_level, draw_lots
+from ginn_jax.limits import Demands, Limits
 from ginn_jax.packets import Demand, EdgeLimit, Edges, radius_edges
 from ginn_jax.receptive_field import (
     Field,
@@ -27,21 +24,6 @@ from ginn_jax.receptive_field import (
     surface_weight,
 )
 from ginn_jax.voxels import VoxelGrid, build_grid
-
-Demands = dict[str, Int[Any, ""]]
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Named capacities; hashable, so that they can be static under jit."""
-
-    sizes: tuple[tuple[str, int], ...]
-
-    def of(self, name: str) -> int:
-        """The capacity called `name`."""
-        if (size := dict(self.sizes).get(name)) is None:
-            raise InputError(f"the limits lack {name}: they are of another network")
-        return size
 
 
 class Geometry(NamedTuple):
@@ -58,40 +40,6 @@ class Geometry(NamedTuple):
     fields: dict[str, Field]
     area: Array | None
     grid: VoxelGrid
-
-
-def fits(limits: Limits, demands: Demands) -> Bool[Array, ""]:
-    """Whether every demand is within its limit."""
-    return jnp.all(jnp.stack([d <= limits.of(name) for name, d in demands.items()]))
-
-
-def exceeded(limits: Limits, demands: Demands) -> dict[str, int]:
-    """Host: the limits that were too small, and what each should have been."""
-    wanted = {name: int(np.max(demand)) for name, demand in demands.items()}
-    return {name: need for name, need in wanted.items() if need > limits.of(name)}
-
-
-def raise_limits(limits: Limits, demands: dict[str, int], slack: float) -> Limits:
-    """Limits that hold each of these demands and `slack` times as much.
-
-    Raises `InputError` for more than arrays can be indexed by; demands stop there.
-    """
-    sizes = dict(limits.sizes)
-    for name, need in demands.items():
-        if need * slack >= LARGEST_INDEX:
-            raise InputError(
-                f"{name} would need {need} or more: points coincide or crowd within "
-                "the radius; merge those, or choose smaller radii"
-            )
-    for name, need in demands.items():
-        sizes[name] = max(sizes[name], round_up(int(need * slack)))
-    return Limits(tuple(sizes.items()))
-
-
-def round_up(count: int) -> int:
-    """A capacity with at most 1/16 to spare, so that few shapes are compiled."""
-    step = 1 << max(count.bit_length() - 4, 6)
-    return -(-count // step) * step
 
 
 def limit_names(config: Network) -> tuple[str, ...]:
@@ -323,31 +271,3 @@ def build_query_field(
         config, config.query, limits, finest, queries, edges, area
     )
     return field, demands | more
-
-
-def measure_limits(
-    limits: Limits, probe: Callable[[Limits, int], Demands], count: int, slack: float
-) -> Limits:
-    """Host: limits that hold the demands of `count` probes, with slack.
-
-    `probe(limits, i)` builds the geometry of example i. `limits` should be generous:
-    the first example is probed with them, the others with twice what the first needed.
-    """
-    largest: dict[str, int] = {}
-    for i in range(count):
-        demands = probe(limits, i)
-        while short := exceeded(limits, demands):
-            limits = raise_limits(limits, short, 2.0)
-            demands = probe(limits, i)
-        for name, demand in demands.items():
-            largest[name] = max(largest.get(name, 0), int(np.max(demand)))
-        if i == 0:
-            limits = limits_for(largest, 2.0)
-    return limits_for(largest, slack)
-
-
-def limits_for(demands: dict[str, int], slack: float) -> Limits:
-    """Limits of `slack` times each demand."""
-    return Limits(
-        tuple((name, round_up(int(d * slack))) for name, d in demands.items())
-    )

@@ -17,7 +17,13 @@ from ginn_jax.architecture import Network
 from ginn_jax.checks import LARGEST, number, real_array, unit_rows
 from ginn_jax.dataset import center_of, relative_to
 from ginn_jax.errors import InputError
-from ginn_jax.geometry import Demands, Limits, exceeded, raise_limits
+from ginn_jax.limits import (
+    Limits,
+    exceeded,
+    most_exceeded,
+    raise_limits,
+    say_raised,
+)
 from ginn_jax.neighbors import bucket, pad_rows
 from ginn_jax.network import Variables
 from ginn_jax.process import ALONE
@@ -66,13 +72,15 @@ def encode_cloud(
     turned, _ = pad_rows(np.asarray(normal, np.float32), rows)
     cloud = Oriented(padded, turned, mask)
     more = pad_channels(material, rows), pad_channels(light, rows)
+    given = limits
     while True:
         deep = without(limits, network.query.name)
         encoded, demands = encode_whole(network, deep, variables, cloud, *more, key)
-        short = exceeded(limits, demands)
-        if not short:
-            return encoded._replace(center=center), limits
+        if not (short := exceeded(limits, demands)):
+            break
         limits = raise_limits(limits, short, SLACK)
+    say_raised(given, limits)
+    return encoded._replace(center=center), limits
 
 
 def check_numbers(name: str, numbers: Any, width: int, rows: int) -> None:
@@ -140,6 +148,7 @@ def shade_points(
     turned, _ = pad_rows(np.asarray(normal, np.float32), rows)
     whole = Oriented(place, turned, mask)
     numbers = tuple(pad_channels(a, rows) for a in (material, light))
+    given = limits
     while True:
         parts, demands = [], []
         flat = only(limits, network.query.name)
@@ -157,20 +166,12 @@ def shade_points(
         if not short:
             break
         limits = raise_limits(limits, short, SLACK)
+    say_raised(given, limits)
     if not parts:
         channels = () if encoded.scale is None else encoded.scale.shape
         return np.zeros((0, *channels), np.float32), limits
     values = [np.moveaxis(np.asarray(part), -1, 0) for part in parts]
     return np.concatenate(values)[: len(position)], limits
-
-
-def most_exceeded(limits: Limits, demands: list[Demands]) -> dict[str, int]:
-    """What at most was needed of each capacity that did not suffice."""
-    short: dict[str, int] = {}
-    for demand in demands:
-        for name, need in exceeded(limits, demand).items():
-            short[name] = max(need, short.get(name, 0))
-    return short
 
 
 @lru_cache(maxsize=8)

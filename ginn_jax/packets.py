@@ -210,8 +210,9 @@ def packet_words(
 
     def test(*lists: Int[Array, "T"]) -> UInt32[Array, "T 32"]:
         packet, first, left = lists
-        row = near.row[jnp.minimum(first[:, None] + bit, near.row.size - 1)]
-        real = bit < left[:, None]
+        place = first[:, None] + bit
+        row = near.row[jnp.minimum(place, near.row.size - 1)]
+        real = (bit < left[:, None]) & (place < near.row.size)
         hit = jnp.float32(0)
         for axis in range(3):
             place = jnp.where(real, point[axis][row], jnp.nan)

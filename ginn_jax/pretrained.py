@@ -22,7 +22,7 @@ from ginn_jax.checkpoint import (
 from ginn_jax.dataset import load_arrays, save_arrays
 from ginn_jax.errors import InputError
 from ginn_jax.files import writing
-from ginn_jax.geometry import Limits
+from ginn_jax.limits import Limits
 from ginn_jax.network import Variables
 from ginn_jax.train import Training, state_shapes
 

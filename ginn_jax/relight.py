@@ -13,16 +13,16 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from ginn_jax.architecture import Network
 from ginn_jax.checks import unit_rows
 from ginn_jax.dataset import center_of, relative_to
-from ginn_jax.geometry import (
-    Demands,
-    Geometry,
-    Limits,
-    build_geometry,
-    build_query_field,
-    exceeded,
-    raise_limits,
-)
+from ginn_jax.geometry import Geometry, build_geometry, build_query_field
 from ginn_jax.image import BLOCK, SLACK, only, pad_channels, without
+from ginn_jax.limits import (
+    Demands,
+    Limits,
+    exceeded,
+    most_exceeded,
+    raise_limits,
+    say_raised,
+)
 from ginn_jax.lit_clouds import LitCloud, network_numbers
 from ginn_jax.mcconv import stored_kernel
 from ginn_jax.neighbors import bucket, pad_rows
@@ -145,7 +145,7 @@ def prepare_relighting(
     """
     unit_rows(cloud.position, cloud.normal, "the cloud")
     unit_rows(queries.position, queries.normal, "queries")
-    center = center_of(cloud.position)
+    center, given = center_of(cloud.position), limits
     points = _padded(cloud, center, slice(None), bucket(len(cloud.position)))
     while True:
         deep = without(limits, network.query.name)
@@ -156,18 +156,19 @@ def prepare_relighting(
     size = min(BLOCK, bucket(len(queries.position)))
     while True:
         flat = only(limits, network.query.name)
-        blocks, short = [], {}
+        blocks, demands = [], []
         for number, first in enumerate(range(0, len(queries.position), size)):
             block = _padded(queries, center, slice(first, first + size), size)
             ends = scene.geometry, block
-            plan, demands = _plan_queries(network, flat, variables, *ends)
+            plan, demand = _plan_queries(network, flat, variables, *ends)
             device = jax.devices()[number % len(jax.devices())]
             blocks.append(jax.device_put(plan, device))
-            for name, need in exceeded(limits, jax.device_get(demands)).items():
-                short[name] = max(need, short.get(name, 0))
-        if not short:
-            return Relightable(scene, tuple(blocks)), limits
+            demands.append(demand)
+        if not (short := most_exceeded(limits, jax.device_get(demands))):
+            break
         limits = raise_limits(limits, short, SLACK)
+    say_raised(given, limits)
+    return Relightable(scene, tuple(blocks)), limits
 
 
 def _padded(

@@ -13,13 +13,8 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from ginn_jax.architecture import Network
 from ginn_jax.dataset import safe_inverse, unit_light
 from ginn_jax.example import points_asked, queries_asked
-from ginn_jax.geometry import (
-    Demands,
-    Geometry,
-    Limits,
-    build_geometry,
-    build_query_field,
-)
+from ginn_jax.geometry import Geometry, build_geometry, build_query_field
+from ginn_jax.limits import Demands, Limits
 from ginn_jax.network import Code, Encoder, Shader, Variables
 from ginn_jax.receptive_field import Field, Oriented, in_coherent_order
 from ginn_jax.voxels import VoxelGrid

@@ -20,7 +20,8 @@ from ginn_jax.architecture import Network
 from ginn_jax.checks import LARGEST_INDEX, LARGEST_SEED, one_of, positive, whole
 from ginn_jax.dataset import ShadedPoints
 from ginn_jax.example import Example, thin_and_search
-from ginn_jax.geometry import Demands, Limits, fits, uniform_limits
+from ginn_jax.geometry import uniform_limits
+from ginn_jax.limits import Demands, Limits, fits
 from ginn_jax.network import Encoder, Shader, Variables
 from ginn_jax.process import ALONE
 

@@ -4,6 +4,7 @@
 they count by hand; here clouds are drawn, and host-level calls are given too little.
 """
 
+import re
 from functools import partial
 
 import jax
@@ -16,7 +17,7 @@ from oracles import neighbors
 from strategies import ALL_PAIRS, POINTS, SEEDS, padded
 
 from ginn_jax import hierarchy, image, packets, train
-from ginn_jax.geometry import Limits
+from ginn_jax.limits import Limits
 from ginn_jax.receptive_field import kde_weight
 from ginn_jax.voxels import build_grid
 
@@ -156,7 +157,7 @@ def counted(monkeypatch, name):
     return calls
 
 
-def test_host_calls_find_room_and_drop_nothing(monkeypatch):
+def test_host_calls_find_room_and_drop_nothing(monkeypatch, caplog):
     """Every capacity lacks one: the result is that with room, after few attempts."""
     network, roomy = tiny.ONE_LEVEL, tiny.ONE_LEVEL_LIMITS
     config = train.Training(network, 1, batch_size=1, points=64, queries=32)
@@ -174,6 +175,7 @@ def test_host_calls_find_room_and_drop_nothing(monkeypatch):
         return values, found
 
     expected, _ = run(roomy)
+    assert not caplog.records
     need = deep[-1] | flat[-1]
     assert (len(deep), len(flat)) == (1, 1)
     values, found = run(one_below(need))
@@ -183,6 +185,10 @@ def test_host_calls_find_room_and_drop_nothing(monkeypatch):
     # Each attempt raises a limit, at most one for each stage of a search and a level.
     assert len(deep) - 1 <= 1 + 5
     assert len(flat) - 1 <= 1 + 4
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == 2, "one line for each call"
+    names = [set(re.findall(r"(\S+) \d+ to \d+", line)) for line in said]
+    assert names[0] | names[1] == set(need)
     again = len(deep), len(flat)
     run(found)
     assert (len(deep), len(flat)) == (again[0] + 1, again[1] + 1)

@@ -10,8 +10,8 @@ import tiny
 from ginn_jax.architecture import DEFAULT
 from ginn_jax.disk_radius import limits_at, with_disk_radius
 from ginn_jax.errors import InputError
-from ginn_jax.geometry import Limits, limits_for
 from ginn_jax.image import SLACK
+from ginn_jax.limits import Limits, limits_for
 
 
 def test_other_disk_radius_changes_the_finest_level_only():

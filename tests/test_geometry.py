@@ -23,6 +23,7 @@ from small_sphere import (
 )
 
 from ginn_jax import geometry as ge
+from ginn_jax import limits as lm
 from ginn_jax.architecture import Network, released_table
 from ginn_jax.packets import Demand, Edges
 
@@ -63,14 +64,14 @@ def test_every_limit_has_its_demand_and_every_demand_its_limit(built):
 
 def test_demands_within_limits_fit(built):
     config, _, _, demands = built
-    exact = ge.Limits(tuple((name, int(d)) for name, d in demands.items()))
+    exact = lm.Limits(tuple((name, int(d)) for name, d in demands.items()))
     for limits in (generous(config), exact):
-        assert ge.fits(limits, as_jax(demands))
-        assert ge.exceeded(limits, as_jax(demands)) == {}
+        assert lm.fits(limits, as_jax(demands))
+        assert lm.exceeded(limits, as_jax(demands)) == {}
     for name in demands:
-        short = ge.Limits(tuple((n, c - (n == name)) for n, c in exact.sizes))
-        assert not ge.fits(short, as_jax(demands))
-        assert ge.exceeded(short, as_jax(demands)) == {name: exact.of(name)}
+        short = lm.Limits(tuple((n, c - (n == name)) for n, c in exact.sizes))
+        assert not lm.fits(short, as_jax(demands))
+        assert lm.exceeded(short, as_jax(demands)) == {name: exact.of(name)}
 
 
 def test_levels_are_nested_poisson_disks(built):
@@ -147,7 +148,7 @@ def test_weights_are_areas_relative_to_the_disk(surface):
 def test_exact_limits_give_the_same_geometry(surface):
     """Larger capacities only add padding."""
     config, geometry, query_field, demands = surface
-    exact = ge.Limits(tuple((name, int(d)) for name, d in demands.items()))
+    exact = lm.Limits(tuple((name, int(d)) for name, d in demands.items()))
     tight, tight_query, same = as_numpy(jitted(config, exact, CLOUD, QUERIES))
     assert same == demands
     count = len(tight.levels[0].mask)

@@ -7,7 +7,7 @@ import tiny
 
 from ginn_jax import image
 from ginn_jax.errors import InputError
-from ginn_jax.geometry import Limits
+from ginn_jax.limits import Limits
 
 KEY = jax.random.key(3)
 PIXELS = 300

@@ -23,10 +23,10 @@ from ginn_jax.geometry import (
     Geometry,
     build_geometry,
     build_query_field,
-    fits,
     limit_names,
     uniform_limits,
 )
+from ginn_jax.limits import fits
 from ginn_jax.network import Encoder, Shader
 from ginn_jax.receptive_field import Field, Oriented
 

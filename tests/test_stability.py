@@ -13,8 +13,8 @@ from benchmarks import stability, stability_cases, stability_stages
 from ginn_jax import dataset, hierarchy, image, irradiance, train
 from ginn_jax.dataset import unit_light
 from ginn_jax.errors import InputError
-from ginn_jax.geometry import Limits, raise_limits
 from ginn_jax.lighting import PointLight
+from ginn_jax.limits import Limits, raise_limits
 from ginn_jax.mesh import Mesh
 
 KEY = jax.random.key(0)

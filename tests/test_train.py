@@ -15,7 +15,8 @@ import pytest
 import tiny
 
 from ginn_jax import example, train
-from ginn_jax.geometry import Geometry, exceeded
+from ginn_jax.geometry import Geometry
+from ginn_jax.limits import exceeded
 from ginn_jax.receptive_field import Oriented
 
 

@@ -12,7 +12,8 @@ import numpy as np
 from ginn_jax import train
 from ginn_jax.architecture import compact_network
 from ginn_jax.dataset import ShadedPoints, stack_clouds
-from ginn_jax.geometry import Limits, limit_names, uniform_limits
+from ginn_jax.geometry import limit_names, uniform_limits
+from ginn_jax.limits import Limits
 
 NETWORK = compact_network(k=4, levels=(0.08, 0.2), query_radius=0.16, latent=4)
 CONFIG = train.Training(

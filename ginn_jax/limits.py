@@ -1,0 +1,115 @@
+"""Capacities of all searches of a network, and what they turned out to need.
+
+Every search reports its true demand under the name of its capacity, so a caller can
+tell which limit to raise. Host-level calls raise it, try again, and say so once.
+"""
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int
+
+from ginn_jax.checks import LARGEST_INDEX
+from ginn_jax.errors import InputError
+
+LOG = logging.getLogger("ginn_jax")
+Demands = dict[str, Int[Any, ""]]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Named capacities; hashable, so that they can be static under jit."""
+
+    sizes: tuple[tuple[str, int], ...]
+
+    def of(self, name: str) -> int:
+        """The capacity called `name`."""
+        if (size := dict(self.sizes).get(name)) is None:
+            raise InputError(f"the limits lack {name}: they are of another network")
+        return size
+
+
+def fits(limits: Limits, demands: Demands) -> Bool[Array, ""]:
+    """Whether every demand is within its limit."""
+    return jnp.all(jnp.stack([d <= limits.of(name) for name, d in demands.items()]))
+
+
+def exceeded(limits: Limits, demands: Demands) -> dict[str, int]:
+    """Host: the limits that were too small, and what each should have been."""
+    wanted = {name: int(np.max(demand)) for name, demand in demands.items()}
+    return {name: need for name, need in wanted.items() if need > limits.of(name)}
+
+
+def most_exceeded(limits: Limits, demands: Sequence[Demands]) -> dict[str, int]:
+    """Host: what at most was needed of each capacity that did not suffice."""
+    short: dict[str, int] = {}
+    for demand in demands:
+        for name, need in exceeded(limits, demand).items():
+            short[name] = max(need, short.get(name, 0))
+    return short
+
+
+def say_raised(given: Limits, found: Limits) -> None:
+    """Host: one line for a caller whose limits did not suffice, nothing otherwise."""
+    old = dict(given.sizes)
+    raised = [f"{n} {old[n]} to {size}" for n, size in found.sizes if size > old[n]]
+    if raised:
+        LOG.warning(
+            "raised %s: pass the limits that come back to spare the second attempt",
+            ", ".join(raised),
+        )
+
+
+def raise_limits(limits: Limits, demands: dict[str, int], slack: float) -> Limits:
+    """Limits that hold each of these demands and `slack` times as much.
+
+    Raises `InputError` for more than arrays can be indexed by; demands stop there.
+    """
+    sizes = dict(limits.sizes)
+    for name, need in demands.items():
+        if need * slack >= LARGEST_INDEX:
+            raise InputError(
+                f"{name} would need {need} or more: points coincide or crowd within "
+                "the radius; merge those, or choose smaller radii"
+            )
+    for name, need in demands.items():
+        sizes[name] = max(sizes[name], round_up(int(need * slack)))
+    return Limits(tuple(sizes.items()))
+
+
+def round_up(count: int) -> int:
+    """A capacity with at most 1/16 to spare, so that few shapes are compiled."""
+    step = 1 << max(count.bit_length() - 4, 6)
+    return -(-count // step) * step
+
+
+def measure_limits(
+    limits: Limits, probe: Callable[[Limits, int], Demands], count: int, slack: float
+) -> Limits:
+    """Host: limits that hold the demands of `count` probes, with slack.
+
+    `probe(limits, i)` builds the geometry of example i. `limits` should be generous:
+    the first example is probed with them, the others with twice what the first needed.
+    """
+    largest: dict[str, int] = {}
+    for i in range(count):
+        demands = probe(limits, i)
+        while short := exceeded(limits, demands):
+            limits = raise_limits(limits, short, 2.0)
+            demands = probe(limits, i)
+        for name, demand in demands.items():
+            largest[name] = max(largest.get(name, 0), int(np.max(demand)))
+        if i == 0:
+            limits = limits_for(largest, 2.0)
+    return limits_for(largest, slack)
+
+
+def limits_for(demands: dict[str, int], slack: float) -> Limits:
+    """Limits of `slack` times each demand."""
+    return Limits(
+        tuple((name, round_up(int(d * slack))) for name, d in demands.items())
+    )
