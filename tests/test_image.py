@@ -4,6 +4,9 @@ import jax
 import numpy as np
 import pytest
 import tiny
+from hypothesis import given, settings
+from hypothesis.extra.numpy import arrays
+from hypothesis.strategies import floats
 
 from ginn_jax import image
 from ginn_jax.errors import InputError
@@ -140,6 +143,33 @@ def test_no_pixel_leaves_the_range(variables, encoded):
     result, _ = image.shade_image(*arguments, *picture(mask), mask)
     assert result[mask].min() == 0
     assert result[mask].max() == 1
+
+
+@settings(max_examples=30, deadline=None)
+@given(arrays(bool, (7, 9)), arrays(np.float32, (7, 9, 3), elements=floats(-5, 5)))
+def test_coherent_pixels_are_those_of_the_mask(mask, position):
+    """Each once; what lies outside the mask may be anything."""
+    position = np.where(mask[:, :, None], position, np.nan)
+    rows = image.coherent_pixels(position, mask)
+    np.testing.assert_array_equal(np.sort(rows), np.flatnonzero(mask))
+
+
+def test_coherent_pixels_of_two_sheets_keep_them_apart():
+    """A chequered mix of near and far: side by side in the image, not in the list."""
+    mask = np.ones((64, 64), bool)
+    far = np.indices(mask.shape).sum(0) % 2
+    plane = np.stack(np.meshgrid(np.arange(64), np.arange(64)), -1) / 64
+    position = np.concatenate([plane, 10.0 * far[..., None]], axis=-1)
+    turns = np.diff(far.reshape(-1)[image.coherent_pixels(position, mask)])
+    assert np.abs(turns).sum() == 1
+
+
+def test_points_in_order_need_no_sorting(variables, encoded, values):
+    points = tiny.sphere_on_plane(PIXELS, 5)
+    ends = points.position, points.normal
+    arguments = (tiny.NETWORK, tiny.LIMITS, variables, encoded, *ends)
+    found, _ = image.shade_points(*arguments, coherent=True)
+    np.testing.assert_allclose(found, values, atol=1e-6)
 
 
 def test_number_of_blocks_is_that_of_the_foreground(
