@@ -66,17 +66,26 @@ def make_layer(
     receiver, sender = find_neighbors(points, points, radius)
     inputs = rng.normal(size=(INPUTS, len(sender))).astype(np.float32)
     inputs[:3] = ((points[receiver] - points[sender]) / radius).T
-    weight = rng.uniform(0.5, 1.5, len(sender)).astype(np.float32)
-    edges = (sender, receiver, inputs, weight, np.int32(len(sender)))
-    field = Field(*map(jnp.asarray, edges))
     key = jax.random.key(options.seed)
     width = options.channels
     kernel = init_kernel(INPUTS, width, options.hidden, width, key=key)
+    weight = rng.uniform(0.5, 1.5, len(sender)).astype(np.float32)
+    weight[at_kink(kernel, inputs)] = 0
+    edges = (sender, receiver, inputs, weight, np.int32(len(sender)))
+    field = Field(*map(jnp.asarray, edges))
     features, cotangent = (
         jnp.asarray(rng.normal(size=(len(points), width)), jnp.float32)
         for _ in range(2)
     )
     return kernel, features, field, cotangent
+
+
+def at_kink(kernel: Kernel, inputs: np.ndarray) -> np.ndarray:
+    """The few edges so near a kink of a ReLU that rounding chooses the slope there."""
+    w1, b1, w2, b2, *_ = (np.asarray(a[0], np.float64) for a in kernel)
+    first = inputs.T @ w1 + b1
+    second = np.maximum(first, 0) @ w2 + b2
+    return np.any(np.abs(np.concatenate([first, second], axis=1)) < 1e-5, axis=1)
 
 
 def ours(layer: Any) -> dict[str, Callable[[], Any]]:

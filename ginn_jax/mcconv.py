@@ -56,6 +56,7 @@ def evaluate_kernel(
     def block(
         w1: Array, b1: Array, w2: Array, b2: Array, w3: Array, b3: Array
     ) -> Float[Array, "K E"]:
+        # XLA's products are fast on weights that lie turned, not on weights it turns.
         w1, w2, w3 = (jax.lax.optimization_barrier(w.T) for w in (w1, w2, w3))
         hidden = jax.nn.relu(w1 @ inputs + b1[:, None])
         hidden = jax.nn.relu(w2 @ hidden + b2[:, None])
@@ -65,9 +66,27 @@ def evaluate_kernel(
     return jnp.concatenate(values)[:outputs]
 
 
-def edges_first(values: Float[Array, "K E"]) -> Float[Array, "E K"]:
-    """The transpose, by itself: the matrix product before it is much slower with it."""
-    return jax.lax.optimization_barrier(values).T
+def _edges_first(
+    kernel: Kernel, inputs: Float[Array, "D E"], outputs: int
+) -> Float[Array, "E K"]:
+    """The transpose of `evaluate_kernel`, by itself: in a product it costs more."""
+    return jax.lax.optimization_barrier(evaluate_kernel(kernel, inputs, outputs)).T
+
+
+def _edges_first_to_differentiate(
+    kernel: Kernel, inputs: Float[Array, "D E"], outputs: int
+) -> Float[Array, "E K"]:
+    """The same in the form whose gradient XLA computes faster, by a fifth."""
+
+    def block(
+        w1: Array, b1: Array, w2: Array, b2: Array, w3: Array, b3: Array
+    ) -> Float[Array, "E K"]:
+        hidden = jax.nn.relu(jnp.einsum("ih,ie->he", w1, inputs) + b1[:, None])
+        hidden = jax.nn.relu(jnp.einsum("ih,ie->he", w2, hidden) + b2[:, None])
+        return jnp.einsum("hk,he->ek", w3, hidden) + b3
+
+    values = [block(*(a[i] for a in kernel)) for i in range(kernel.w1.shape[0])]
+    return jnp.concatenate(values, axis=-1)[:, :outputs]
 
 
 def mc_conv(
@@ -107,6 +126,7 @@ def apply_stored(
 
 
 def _stored(
+    evaluate: Any,
     kernel: None,
     outputs: int,
     features: Float[Array, "T C"],
@@ -117,6 +137,7 @@ def _stored(
 
 
 def _depth_wise(
+    evaluate: Any,
     kernel: Kernel,
     outputs: int,
     features: Float[Array, "T C"],
@@ -124,11 +145,11 @@ def _depth_wise(
     weight: Float[Array, "T"],
 ) -> Float[Array, "T C"]:
     """What every edge of a tile adds to its receiver."""
-    values = evaluate_kernel(kernel, inputs, outputs) * weight
-    return edges_first(values) * features
+    return evaluate(kernel, inputs, outputs) * features * weight[:, None]
 
 
 def _mixing(
+    evaluate: Any,
     kernel: Kernel,
     outputs: int,
     features: Float[Array, "T C"],
@@ -136,9 +157,9 @@ def _mixing(
     weight: Float[Array, "T"],
 ) -> Float[Array, "T K"]:
     """What every edge of a tile adds to its receiver, every channel from all."""
-    values = evaluate_kernel(kernel, inputs, outputs * features.shape[1]) * weight
-    values = edges_first(values).reshape(-1, outputs, features.shape[1])
-    return jnp.sum(values * features[:, None], axis=-1)
+    values = evaluate(kernel, inputs, outputs * features.shape[1])
+    values = values.reshape(-1, outputs, features.shape[1])
+    return jnp.sum(values * features[:, None], axis=-1) * weight[:, None]
 
 
 class _Tile(NamedTuple):
@@ -183,7 +204,8 @@ def _convolve(
 
     def add(tile: _Tile, total: Float[Array, "M K"]) -> Float[Array, "M K"]:
         given = features[tile.sender]
-        values = combine(kernel, outputs, given, tile.inputs, tile.weight)
+        edges = given, tile.inputs, tile.weight
+        values = combine(_edges_first, kernel, outputs, *edges)
         return total.at[tile.receiver].add(values, mode="drop")
 
     return _over_tiles(field, add, jnp.zeros((receivers, outputs), features.dtype))
@@ -210,7 +232,9 @@ def _convolve_backward(
         received = cotangent[jnp.minimum(tile.receiver, receivers - 1)]
         received = jnp.where((tile.receiver < receivers)[:, None], received, 0.0)
         _, pull = jax.vjp(
-            lambda k, f, x, w: combine(k, outputs, f, x, w),
+            lambda k, *edges: combine(
+                _edges_first_to_differentiate, k, outputs, *edges
+            ),
             *(kernel, features[tile.sender], tile.inputs, tile.weight),
         )
         k, f, x, w = pull(received)

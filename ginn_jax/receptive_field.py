@@ -23,7 +23,7 @@ from ginn_jax.packets import Edges
 from ginn_jax.voxels import expand_ranges, morton_order
 
 # Not a power of two, or the rows of a tile would share the same few lines of a cache.
-TILE = 4112
+TILE = 16400
 
 
 class Field(NamedTuple):
