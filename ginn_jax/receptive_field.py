@@ -22,8 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ginn_jax.packets import Edges
 from ginn_jax.voxels import expand_ranges, morton_order
 
-# Not a power of two, or the rows of a tile would share the same few lines of a cache.
-TILE = 16400
+TILE = 8192
 
 
 class Field(NamedTuple):
@@ -54,8 +53,15 @@ def in_coherent_order(points: Oriented) -> tuple[Oriented, Int[Array, "N"]]:
 
 
 def tile_size(edges: int) -> int:
-    """Edges of a tile: everything at once where there is no cache to fit."""
-    return min(TILE, edges) if jax.default_backend() == "cpu" else edges
+    """Edges of a tile: everything at once where there is no cache to fit.
+
+    Tiles share the edges out evenly. Their size is an odd multiple of 16: of a power of
+    two, all rows of a tile would compete for the same few lines of the cache.
+    """
+    if jax.default_backend() != "cpu":
+        return edges
+    tiles = -(-edges // TILE)
+    return min(-(-edges // (16 * max(tiles, 1))) * 16 | 16, edges)
 
 
 def tile_count(edges: int, count: Int[Array, ""]) -> Int[Array, ""]:
