@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments import evaluate as experiment
-from ginn_jax import checkpoint, compare_report
+from ginn_jax import checkpoint, compare_networks, compare_report, image, scenes
 from ginn_jax.compare_networks import OURS
 from ginn_jax.compare_report import (
     RIVALS,
@@ -95,7 +95,11 @@ def finished_run(folder):
     return folder
 
 
-def test_comparison_ends_in_a_report_and_keeps_its_references(tmp_path):
+def test_comparison_ends_in_a_report_and_keeps_its_references(tmp_path, monkeypatch):
+    monkeypatch.setattr(scenes, "ProcessPoolExecutor", tiny.Here)
+    # Every picture has full blocks, so one shape is compiled.
+    for module in (image, compare_networks):
+        monkeypatch.setattr(module, "BLOCK", 128)
     run = finished_run(tmp_path / "run")
     options = experiment.Options(
         "ao",

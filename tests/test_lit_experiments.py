@@ -11,7 +11,7 @@ import tiny
 from benchmarks import generation
 from benchmarks import relight as relight_benchmark
 from experiments import gi_train, sss_train
-from ginn_jax import architecture, evaluate_light, image, lit_experiment
+from ginn_jax import architecture, evaluate_light, image, lit_experiment, scenes
 from ginn_jax.errors import InputError
 from ginn_jax.geometry import uniform_limits
 from ginn_jax.lit_clouds import LitCloud
@@ -39,6 +39,8 @@ def test_a_small_run_leaves_all_that_is_promised(effect, tmp_path, monkeypatch):
     network = replace(tiny.ONE_LEVEL, lights=1, **more)
     monkeypatch.setitem(table, "homogeneous", network)
     monkeypatch.setattr(image, "BLOCK", 128)
+    # Workers are tested with the scenes.
+    monkeypatch.setattr(scenes, "ProcessPoolExecutor", tiny.Here)
     # That they are measured is tested where occlusion is.
     limits = uniform_limits(network, 1 << 15)
     monkeypatch.setattr("ginn_jax.fit.training_limits", lambda *_: limits)

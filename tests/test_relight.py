@@ -16,12 +16,12 @@ from ginn_jax.relight import prepare_relighting, relight
 KEY = jax.random.key(1)
 MEDIUM = replace(tiny.ONE_LEVEL, materials=3, lights=1, asks="all")
 LOCAL = replace(MEDIUM, local=True)
-# Pooling and its way back once for what is linear, once for what is not, and where
+# Pooling and its way back once for what is linear, and once for what is not: where
 # nothing but f_3D can be nonlinear.
 EFFECTS = {
     "illumination": replace(tiny.NETWORK, linear=True, materials=1, lights=1),
     "scattering": replace(MEDIUM, linear=True),
-    "homogeneous": replace(tiny.NETWORK, materials=1, lights=1),
+    "homogeneous": replace(tiny.ONE_LEVEL, materials=1, lights=1),
     "local": LOCAL,
     "only_2d": only_2d(LOCAL),
     "only_3d": only_3d(

@@ -3,6 +3,7 @@
 What takes a compilation is cached by it, so that all test files share it.
 """
 
+from concurrent.futures import Executor, Future
 from contextlib import contextmanager
 from functools import cache
 
@@ -102,6 +103,21 @@ def cheap_compiling():
         yield
     finally:
         jax.config.update("jax_disable_most_optimizations", before)
+
+
+class Here(Executor):
+    """What stands in for a pool of processes, each of which takes seconds to begin."""
+
+    def __init__(self, *_, **__):
+        pass
+
+    def submit(self, function, /, *args, **kwargs):
+        done = Future()
+        try:
+            done.set_result(function(*args, **kwargs))
+        except Exception as error:
+            done.set_exception(error)
+        return done
 
 
 def identical(a, b):
