@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ginn_jax import geometry as ge
+from ginn_jax import limits as lm
 from ginn_jax.architecture import compact_network
 from ginn_jax.receptive_field import Oriented
 
@@ -53,7 +54,7 @@ def demands_of(config, limits, stages, cloud, queries):
 
 def generous(config):
     names = ge.limit_names(config)
-    return ge.Limits(tuple((n, GENEROUS[n.split(".")[1]]) for n in names))
+    return lm.Limits(tuple((n, GENEROUS[n.split(".")[1]]) for n in names))
 
 
 def as_numpy(tree):

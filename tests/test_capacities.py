@@ -179,7 +179,8 @@ def test_host_calls_find_room_and_drop_nothing(monkeypatch, caplog):
     need = deep[-1] | flat[-1]
     assert (len(deep), len(flat)) == (1, 1)
     values, found = run(one_below(need))
-    np.testing.assert_allclose(values, expected, rtol=1e-5, atol=1e-6)
+    # Other capacities, other tiles: sums in another order.
+    np.testing.assert_allclose(values, expected, rtol=1e-4, atol=1e-5)
     assert deep[-1] | flat[-1] == need
     assert all(found.of(name) >= n for name, n in need.items())
     # Each attempt raises a limit, at most one for each stage of a search and a level.

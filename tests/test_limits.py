@@ -15,6 +15,7 @@ from small_sphere import (
 )
 
 from ginn_jax import geometry as ge
+from ginn_jax import limits as lm
 from ginn_jax.architecture import PRESETS
 
 
@@ -27,7 +28,7 @@ def _cheap_compiling():
 @pytest.fixture(scope="module")
 def shallow():
     demands = as_numpy(demands_of(SHALLOW, generous(SHALLOW), "", CLOUD, QUERIES))
-    assert ge.fits(generous(SHALLOW), as_jax(demands))
+    assert lm.fits(generous(SHALLOW), as_jax(demands))
     return demands
 
 
@@ -45,12 +46,12 @@ def shallow():
 )
 def test_limits_that_are_too_small_are_named(shallow, names):
     sizes = dict(generous(SHALLOW).sizes)
-    limits = ge.Limits(tuple((sizes | {n: int(shallow[n]) - 1 for n in names}).items()))
+    limits = lm.Limits(tuple((sizes | {n: int(shallow[n]) - 1 for n in names}).items()))
     # Level 0 is the first: a shortage there leaves the others a lower bound.
     stages = "level_0" if names[0].startswith("level_0") else ""
     demands = demands_of(SHALLOW, limits, stages, CLOUD, QUERIES)
-    assert not ge.fits(limits, demands)
-    assert ge.exceeded(limits, demands) == {name: shallow[name] for name in names}
+    assert not lm.fits(limits, demands)
+    assert lm.exceeded(limits, demands) == {name: shallow[name] for name in names}
 
 
 @pytest.mark.parametrize("start", [100, 1 << 14])
@@ -64,10 +65,10 @@ def test_measured_limits_fit(start, sizes):
         return as_jax(demands_by_hand(sizes[i], limits))
 
     first = ge.uniform_limits(SHALLOW, start)
-    limits = ge.measure_limits(first, probe, 2, slack=1.0)
+    limits = lm.measure_limits(first, probe, 2, slack=1.0)
     assert tried[0] == (0, first)
     for i in range(2):
-        assert ge.exceeded(limits, probe(limits, i)) == {}
+        assert lm.exceeded(limits, probe(limits, i)) == {}
 
 
 def demands_by_hand(size, limits):
@@ -81,8 +82,8 @@ def demands_by_hand(size, limits):
 
 
 def test_raised_limits_hold_the_demands_and_leave_the_rest():
-    limits = ge.Limits((("a", 100), ("b", 1000), ("c", 7)))
-    raised = ge.raise_limits(limits, {"a": 300, "b": 10}, 1.5)
+    limits = lm.Limits((("a", 100), ("b", 1000), ("c", 7)))
+    raised = lm.raise_limits(limits, {"a": 300, "b": 10}, 1.5)
     assert raised.of("a") >= 450
     assert (raised.of("b"), raised.of("c")) == (1000, 7)
     assert hash(raised) != hash(limits)
@@ -90,7 +91,7 @@ def test_raised_limits_hold_the_demands_and_leave_the_rest():
 
 @given(st.integers(0, 10**8))
 def test_rounded_capacities_hold_their_count(count):
-    size = ge.round_up(count)
+    size = lm.round_up(count)
     assert count <= size <= max(count * 9 / 8, count + 64)
 
 
