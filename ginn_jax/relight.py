@@ -14,7 +14,7 @@ from ginn_jax.architecture import Network
 from ginn_jax.checks import unit_rows
 from ginn_jax.dataset import center_of, relative_to
 from ginn_jax.geometry import Geometry, build_geometry, build_query_field
-from ginn_jax.image import BLOCK, SLACK, only, pad_channels, without
+from ginn_jax.image import SLACK, block_size, only, pad_channels, without
 from ginn_jax.limits import (
     Demands,
     Limits,
@@ -153,7 +153,7 @@ def prepare_relighting(
         if not (short := exceeded(limits, demands)):
             break
         limits = raise_limits(limits, short, SLACK)
-    size = min(BLOCK, bucket(len(queries.position)))
+    size = block_size(len(queries.position), lit=True)
     while True:
         flat = only(limits, network.query.name)
         blocks, demands = [], []
@@ -195,7 +195,7 @@ def relight(
     numbers = (pad_channels(a, rows) for a in network_numbers(cloud))
     lit = _encode_planned(network, variables, ready.scene, *numbers)
     copies = [jax.device_put((variables, lit), device) for device in jax.devices()]
-    size, parts = min(BLOCK, bucket(len(queries.position))), []
+    size, parts = block_size(len(queries.position), lit=True), []
     asked = network_numbers(queries) if network.asks == "all" else (None, None)
     for number, plan in enumerate(ready.blocks):
         part = slice(number * size, (number + 1) * size)
