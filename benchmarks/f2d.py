@@ -27,7 +27,6 @@ from ginn_jax.commandline import require, start
 from ginn_jax.geometry import uniform_limits
 from ginn_jax.limits import Limits
 from ginn_jax.mesh import find_meshes
-from ginn_jax.neighbors import bucket
 from ginn_jax.network import Variables
 from ginn_jax.receptive_field import Oriented
 from ginn_jax.reference import GBuffer, Scene
@@ -113,12 +112,11 @@ def compare(
     variables = jax.device_put(state.variables, jax.devices()[0])
     cloud = lit_scenes.visible_samples(scene, options.points, seed=0)
     key = jax.random.key(0)
-    limits = uniform_limits(network, 1 << 17)
-    encode = partial(image.encode_cloud, network)
-    arrays = variables, cloud.position, cloud.normal
-    encoded, limits = encode(limits, *arrays, key=key)
-    limits = tight_limits(limits, int(np.sum(encoded.points.mask)))
-    encoded, limits = encode(limits, *arrays, key=key)
+    # They have to be raised, so they end up close to the need.
+    limits = uniform_limits(network, 1 << 12)
+    encoded, limits = image.encode_cloud(
+        network, limits, variables, cloud.position, cloud.normal, key=key
+    )
     pixels = gbuffer.position, gbuffer.normal, gbuffer.mask
     _, limits = image.shade_image(network, limits, variables, encoded, *pixels)
 
@@ -155,12 +153,6 @@ def compare(
         "block_bytes": block_memory(network, limits, variables, encoded),
         "timings": timings,
     }
-
-
-def tight_limits(limits: Limits, points: int) -> Limits:
-    """Room for so many points, and for a block of queries what it turns out to need."""
-    sizes = {n: 512 if n.startswith("query.") else size for n, size in limits.sizes}
-    return Limits(tuple((sizes | {"level_0.points": bucket(points)}).items()))
 
 
 def block_memory(

@@ -28,7 +28,7 @@ from ginn_jax.neighbors import bucket, pad_rows
 from ginn_jax.network import Variables
 from ginn_jax.process import ALONE
 from ginn_jax.receptive_field import Oriented
-from ginn_jax.shading import Encoded, encode, shade
+from ginn_jax.shading import Encoded, encode, numbers_asked, shade
 from ginn_jax.upsample import Surface, sample_pixels, upsample
 from ginn_jax.voxels import morton_code
 
@@ -152,7 +152,8 @@ def shade_points(
     place, mask = pad_rows(relative_to(center, position), rows)
     turned, _ = pad_rows(np.asarray(normal, np.float32), rows)
     whole = Oriented(place, turned, mask)
-    numbers = tuple(pad_channels(a, rows) for a in (material, light))
+    asked = numbers_asked(network, material, light)
+    numbers = tuple(pad_channels(a, rows) for a in asked)
     given = limits
     while True:
         parts, demands = [], []
@@ -239,6 +240,7 @@ def shade_image(
         raise InputError(f"resolution scale {resolution_scale}: give it in (0, 1]")
     channels = () if encoded.scale is None else encoded.scale.shape
     values = np.full((*mask.shape, *channels), background, np.float32)
+    material, light = numbers_asked(network, material, light)
     pixel, surface = coherent_pixels(position, mask), Surface(position, normal, mask)
 
     def shade(wanted: Bool[np.ndarray, "H W"], limits: Limits) -> Limits:

@@ -29,7 +29,7 @@ from ginn_jax.neighbors import bucket, pad_rows
 from ginn_jax.network import STORED, Code, Variables
 from ginn_jax.process import ALONE
 from ginn_jax.receptive_field import Field, Oriented, in_coherent_order
-from ginn_jax.shading import encode_channels, shade_channels
+from ginn_jax.shading import encode_channels, numbers_asked, shade_channels
 
 
 class ScenePlan(NamedTuple):
@@ -196,7 +196,7 @@ def relight(
     lit = _encode_planned(network, variables, ready.scene, *numbers)
     copies = [jax.device_put((variables, lit), device) for device in jax.devices()]
     size, parts = block_size(len(queries.position), lit=True), []
-    asked = network_numbers(queries) if network.asks == "all" else (None, None)
+    asked = numbers_asked(network, *network_numbers(queries))
     for number, plan in enumerate(ready.blocks):
         part = slice(number * size, (number + 1) * size)
         own = (None if a is None else pad_channels(a[:, part], size) for a in asked)

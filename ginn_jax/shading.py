@@ -135,9 +135,13 @@ def shade_channels(
             values = jnp.zeros_like(values).at[order].set(values)
         return values if scale is None else values * scale
 
-    if network.asks == "normal":
-        material = light = None
+    material, light = numbers_asked(network, material, light)
     return per_channel(channel, code, scale, material, light)
+
+
+def numbers_asked(network: Network, material: Any, light: Any) -> tuple[Any, Any]:
+    """Material and light of queries as far as f_2D sees them: both, or None."""
+    return (material, light) if network.asks == "all" else (None, None)
 
 
 def per_channel(function: Any, *arrays: Any) -> Any:

@@ -51,6 +51,15 @@ def unchecked():
     config.update("jaxtyping_disable", False)
 
 
+@pytest.fixture(scope="module")
+def cheap_compiling():
+    """For modules that test wiring: XLA compiles quickly and does not optimise."""
+    import tiny  # brings in the package, which the hook has to be there for
+
+    with tiny.cheap_compiling():
+        yield
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _forget_compilations():
     """Each module's own: thousands of kernels exhaust the maps a process may have."""

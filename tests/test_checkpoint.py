@@ -15,10 +15,7 @@ LIMITS = tiny.ONE_LEVEL_LIMITS
 EXTRA = {"clouds": 12, "rays": 64}
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _cheap_compiling():
-    with tiny.cheap_compiling():
-        yield
+pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
 
 def after(state, steps):

@@ -78,10 +78,7 @@ def test_inset_lies_where_the_reference_varies():
     assert column <= 25 <= column + size
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _cheap_compiling():
-    with tiny.cheap_compiling():
-        yield
+pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
 
 def finished_run(folder):

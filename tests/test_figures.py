@@ -12,11 +12,7 @@ from experiments import animation, environment_maps, latent_features
 from ginn_jax import compare_networks, image, train
 from ginn_jax.errors import InputError
 
-
-@pytest.fixture(autouse=True, scope="module")
-def _cheap_compiling():
-    with tiny.cheap_compiling():
-        yield
+pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
 
 @cache

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
-import tiny
 from hypothesis import given
 from hypothesis import strategies as st
 from small_sphere import (
@@ -27,11 +26,7 @@ from ginn_jax import limits as lm
 from ginn_jax.architecture import Network, released_table
 from ginn_jax.packets import Demand, Edges
 
-
-@pytest.fixture(autouse=True, scope="module")
-def _cheap_compiling():
-    with tiny.cheap_compiling():
-        yield
+pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
 
 @pytest.fixture(scope="module", params=NETWORKS)

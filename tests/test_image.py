@@ -16,10 +16,7 @@ KEY = jax.random.key(3)
 PIXELS = 300
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _cheap_compiling():
-    with tiny.cheap_compiling():
-        yield
+pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
 
 @pytest.fixture(autouse=True)

@@ -1,7 +1,6 @@
 """Limits of a network on a cloud: every one in turn too small, measured, raised."""
 
 import pytest
-import tiny
 from hypothesis import given
 from hypothesis import strategies as st
 from small_sphere import (
@@ -18,11 +17,7 @@ from ginn_jax import geometry as ge
 from ginn_jax import limits as lm
 from ginn_jax.architecture import PRESETS
 
-
-@pytest.fixture(autouse=True, scope="module")
-def _cheap_compiling():
-    with tiny.cheap_compiling():
-        yield
+pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
 
 @pytest.fixture(scope="module")

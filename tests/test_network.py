@@ -68,10 +68,7 @@ COMPACT = compact_network(k=4, levels=(0.08, 0.1), query_radius=0.2, latent=4)
 ROWS = 320
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _cheap_compiling():
-    with tiny.cheap_compiling():
-        yield
+pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
 
 def unfilled(network, attributes, query_attributes):

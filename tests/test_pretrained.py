@@ -17,10 +17,7 @@ MANIFEST = pretrained.load_manifest()
 FULL = [name for name in ("ao", "gi", "sss") if name in MANIFEST]
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _cheap_compiling():
-    with tiny.cheap_compiling():
-        yield
+pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
 
 @cache

@@ -30,10 +30,7 @@ EFFECTS = {
 }
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _cheap_compiling():
-    with tiny.cheap_compiling():
-        yield
+pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
 
 @pytest.fixture(autouse=True)
