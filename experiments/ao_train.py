@@ -17,6 +17,7 @@ from rich.console import Console
 
 from ginn_jax import architecture, evaluate, fit, objects, report, scenes
 from ginn_jax.commandline import require_positive, start
+from ginn_jax.dataset import count_given
 from ginn_jax.disk_radius import limits_at, with_disk_radius
 from ginn_jax.experiment import (
     Clock,
@@ -33,7 +34,7 @@ from ginn_jax.train import Training
 
 UNSEEN_SEED = 10_000_000
 VALIDATION_RAYS = 1024
-DISK_RADII = (0.015, 0.02, 0.03)
+DISK_RADII = (0.01, 0.015, 0.02)
 RAY_COUNTS = (1, 4, 16, 64, 256)
 
 
@@ -43,8 +44,10 @@ class Options(RunOptions):
 
     out: Path = Path("runs/ao_train")
     """Folder for data, checkpoints, metrics.json, report.md and figures."""
-    shapes: int = 240
+    shapes: int = 400
     """Procedural shapes to train on."""
+    points: int = 32_000
+    """Samples per object."""
     rays: int = 64
     """Rays per training point."""
     radius: float = 0.1
@@ -182,7 +185,7 @@ def image_evaluation(
             with_disk_radius(network, radius),
         )
         for (source, whole), view in zip(shown, views, strict=True):
-            cloud = evaluate.split_cloud(whole, len(whole.position) * 4 // 5)[0]
+            cloud = evaluate.split_cloud(whole, count_given(len(whole.position)))[0]
             row, image, held = evaluate.network_row(variant, held, model, cloud, view)
             rows.append(row | {"name": source.name})
             if radius == own:

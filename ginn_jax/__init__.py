@@ -23,6 +23,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     subsurface        radiant exitance by random walks in a medium
     objects           which objects and lights there are, and which go together
     voxels            fixed-capacity voxel hash under jit
+    candidates        points that packets of queries may be near
     packets           radius search by packets of queries under jit
     neighbors         radius search on the host: exact, sizes itself
     hierarchy         Poisson disk sampling
@@ -33,6 +34,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     lit_scenes        scenes with materials and a light; global illumination, scattering
     scenes            from objects to clouds with ground truth, in worker processes
     architecture      the network as a table of layers; presets
+    limits            capacities of all searches, and what they needed
     geometry          levels, edges and weights of a cloud; capacities and demands
     network           f_3D and f_2D
     example           what a training step computes before any parameter enters
@@ -40,6 +42,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     checkpoint        saving, resuming, loading weights
     fit               the training loop of a run
     shading           f_3D of a cloud and f_2D of queries, in every colour channel
+    disk_radius       a trained network on finer or coarser points
     upsample          shading at a lower rate, guided by the G-buffer
     image             from a cloud and a G-buffer to an image
     relight           what does not depend on the light, kept for any light

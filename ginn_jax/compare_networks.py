@@ -13,7 +13,7 @@ from ginn_jax import evaluate, evaluate_light
 from ginn_jax.architecture import Network
 from ginn_jax.checkpoint import load_weights
 from ginn_jax.compare import Picture, Shot, Values, relative_error, scratch_mib
-from ginn_jax.dataset import ShadedPoints
+from ginn_jax.dataset import ShadedPoints, count_given
 from ginn_jax.evaluate import Model, Row, View
 from ginn_jax.evaluate_light import LitView
 from ginn_jax.image import (
@@ -57,7 +57,7 @@ def load_networks(
 
 def points_given(cloud: Any) -> tuple[Any, np.ndarray | None]:
     """The part of a cloud that networks are given, and the units of its light."""
-    count = len(cloud.position) * 4 // 5
+    count = count_given(len(cloud.position))
     if not isinstance(cloud, LitCloud):
         return evaluate.split_cloud(cloud, count)[0], None
     given = split_points(cloud, count)[0]

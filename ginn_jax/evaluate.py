@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from ginn_jax.architecture import Network
 from ginn_jax.camera import Camera, orbit_camera
-from ginn_jax.dataset import ShadedPoints
+from ginn_jax.dataset import ShadedPoints, count_given
 from ginn_jax.image import as_openness, encode_cloud, shade_image, shade_points
 from ginn_jax.limits import Limits
 from ginn_jax.mesh import Mesh
@@ -60,8 +60,7 @@ def evaluate_clouds(
     """
     rows = []
     for name, cloud in zip(names, clouds, strict=True):
-        count = len(cloud.position) * 4 // 5
-        given, asked = split_cloud(cloud, count)
+        given, asked = split_cloud(cloud, count_given(len(cloud.position)))
         encoded, limits = encode_cloud(
             network,
             limits,

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from ginn_jax import evaluate_light, fit, report
 from ginn_jax.architecture import Network
+from ginn_jax.dataset import count_given
 from ginn_jax.evaluate import Model, mean_rows
 from ginn_jax.experiment import (
     Clock,
@@ -88,7 +89,9 @@ def run_experiment(
     folder = options.out / "data"
     clouds = make(console, "training clouds", seen, settings, folder / "training")
     paths = max(settings.paths, VALIDATION_PATHS)
-    exact = replace(settings, paths=paths, targets=settings.points // 5)
+    exact = replace(
+        settings, paths=paths, targets=settings.points - count_given(settings.points)
+    )
     exact = exact if not options.quick else replace(exact, paths=16)
     tests = {
         name: make(console, f"unseen, {name}", sources, exact, folder / name)
@@ -205,7 +208,7 @@ def image_evaluation(
     paths = settings.paths // 4
     for source, cloud in shown:
         view = evaluate_light.lit_view(source, settings, paths, options.resolution)
-        cloud = split_points(cloud, len(cloud.position) * 4 // 5)[0]
+        cloud = split_points(cloud, count_given(len(cloud.position)))[0]
         given = config.network, limits, model, cloud, view
         row, values, encoded, limits = evaluate_light.lit_network_row(*given)
         units = np.asarray(encoded.scale)

@@ -28,6 +28,7 @@ from ginn_jax.slab import single_scattering_albedo
 from ginn_jax.subsurface import Medium, subsurface_exitance
 
 FAR, PROBE_RAYS = 100.0, 32
+OBJECT = 0  # the material of what stands on the ground
 # Mean free paths in the length of an object beyond which nothing is seen to change.
 DENSEST = 500.0
 
@@ -167,23 +168,34 @@ def lit_points(lit: Lit, samples: Samples, looks: int, *, seed: int) -> LitCloud
 
 
 def visible_samples(scene: Scene, count: int, seed: int) -> Samples:
-    """Uniform samples of the surface that light can reach.
+    """Uniform samples of the surface that light can reach, on both its sides.
 
     Meshes of many parts hide surface inside other parts, where no camera can be; it
     would only take points away from what is seen. A sample is dropped if none of
-    `PROBE_RAYS` rays from it leaves the scene.
+    `PROBE_RAYS` rays from it leaves the scene. So the inside of what is closed is
+    dropped, and a sheet without thickness has samples with normals to either side, as
+    a camera sees it. The ground has one side.
 
     Raises:
         InputError: a scene that is almost all sealed off.
     """
-    drawn = count
+    drawn = 5 * count // 2
     for _ in range(5):
-        samples = sample_surface(scene.mesh, drawn, seed=seed)
+        samples = sample_sides(scene.mesh, drawn, seed)
         seen = reached_by_light(scene, samples, seed)
         if len(seen) >= count:
             return Samples(*(a[seen[:count]] for a in samples))
         drawn = 2 * drawn
     raise InputError("nearly all of the mesh's surface is sealed inside it: mend it")
+
+
+def sample_sides(mesh: Mesh, count: int, seed: int) -> Samples:
+    """At most `count` uniform samples; the normals of the object's to either side."""
+    position, normal, material = sample_surface(mesh, count, seed=seed)
+    behind = np.random.default_rng((seed, 7)).random(count) < 0.5
+    normal = np.where(behind[:, None], -normal, normal)
+    kept = ~behind | (material == OBJECT)
+    return Samples(position[kept], normal[kept], material[kept])
 
 
 def reached_by_light(scene: Scene, samples: Samples, seed: int) -> Int[np.ndarray, "K"]:

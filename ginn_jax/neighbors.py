@@ -10,18 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ginn_jax.checks import real_array
-from ginn_jax.errors import InputError
-from ginn_jax.packets import (
+from ginn_jax.candidates import (
     PACKET,
     Candidates,
-    Words,
     count_words,
-    list_bits,
     packet_candidates,
     packet_columns,
-    packet_words,
 )
+from ginn_jax.checks import real_array
+from ginn_jax.errors import InputError
+from ginn_jax.packets import Words, list_bits, packet_words
 from ginn_jax.process import available_cores
 from ginn_jax.voxels import VoxelGrid, build_grid, morton_order
 

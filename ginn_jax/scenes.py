@@ -17,7 +17,7 @@ from ginn_jax.reference import ambient_occlusion, build_scene
 
 # Bounds what a renderer could leak in one process.
 SCENES_PER_WORKER = 200
-FORMAT = 3
+FORMAT = 4
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""An endless seeded source of closed shapes to train on, with the variety of real ones.
+"""An endless seeded source of shapes to train on, with the variety of real ones.
 
 `FAMILIES` is the table of what there is; `random_shape` draws from it.
 """
@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 
 from ginn_jax import built_shapes as built
+from ginn_jax import clad_shapes as clad
 from ginn_jax import curved_shapes as curved
 from ginn_jax import grown_shapes as grown
 from ginn_jax.checks import whole
@@ -20,11 +21,15 @@ MOST_FACES = 60_000
 
 
 class Family(NamedTuple):
-    """How to make one kind of shape, how often, and whether it has to stand upright."""
+    """How to make one kind of shape, how often, whether it has to stand upright.
+
+    Its parts are closed, unless it is `clad` in plates that may have no backs.
+    """
 
     make: Callable[[np.random.Generator], trimesh.Trimesh]
     weight: float
     upright: bool
+    clad: bool = False
 
 
 def pile(rng: np.random.Generator) -> trimesh.Trimesh:
@@ -45,6 +50,11 @@ def pile(rng: np.random.Generator) -> trimesh.Trimesh:
     return join(solids)
 
 
+def armour(rng: np.random.Generator) -> trimesh.Trimesh:
+    """A shape of another family under plates."""
+    return clad.scaled(rng, FAMILIES[rng.choice(_CLAD)].make(rng))
+
+
 FAMILIES = {
     "blob": Family(grown.blob, 3, False),
     "carving": Family(grown.carving, 2, False),
@@ -63,12 +73,16 @@ FAMILIES = {
     "cloth": Family(curved.cloth, 1.5, False),
     "vehicle": Family(built.vehicle, 2, True),
     "pile": Family(pile, 3, True),
+    "timber_house": Family(clad.timber_house, 2.5, True, clad=True),
+    "well": Family(clad.well, 1, True, clad=True),
+    "armour": Family(armour, 2, True, clad=True),
 }
+_CLAD = ["blob", "carving", "statue", "person", "animal", "vase", "vehicle"]
 _PILED = ["blob", "carving", "shell", "vase", "tower", "cloth", "bars", "vehicle"]
 
 
 def random_shape(seed: int) -> Mesh:
-    """Shape number `seed` (>= 0): closed parts that face outward, unit box, +y up."""
+    """Shape number `seed` (>= 0): faces look outward, unit box, +y up."""
     rng = np.random.default_rng(whole("seed", seed, 0, 2**63 - 1))
     weight = np.array([family.weight for family in FAMILIES.values()])
     name = rng.choice(list(FAMILIES), p=weight / weight.sum())

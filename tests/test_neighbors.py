@@ -26,6 +26,7 @@ from strategies import (
 from ginn_jax import neighbors as nb
 from ginn_jax import packets as pk
 from ginn_jax import voxels as vx
+from ginn_jax.candidates import PACKET
 from ginn_jax.errors import InputError
 
 INT32_MAX = 2**31 - 1
@@ -152,7 +153,7 @@ def test_jitted_search_equals_brute_force_but_for_rounding(points, queries, radi
     edges = edges_of(points, queries, radius)
     sure, possible = sandwich(points, queries, radius)
     assert sure <= pairs_of(edges, queries) <= possible
-    assert edges.demand.edges <= pk.PACKET * edges.demand.candidates
+    assert edges.demand.edges <= PACKET * edges.demand.candidates
     assert edges.demand.candidates <= ALL_PAIRS.candidates
 
 

@@ -11,6 +11,7 @@ from oracles import neighbors
 
 from ginn_jax import packets as pk
 from ginn_jax import voxels as vx
+from ginn_jax.candidates import PACKET
 
 pick = jax.jit(pk.select_bit)
 search = jax.jit(pk.radius_edges, static_argnames="limit")
@@ -58,10 +59,10 @@ def pairs(points, queries, radius, limit=ROOM):
 
 def test_lists_of_several_words_and_a_last_packet_that_is_not_full(crowd):
     points, queries = crowd
-    assert len(queries) % pk.PACKET
+    assert len(queries) % PACKET
     found, demand = pairs(points, queries, 0.3)
     assert found == set(neighbors(points.astype(float), queries.astype(float), 0.3))
-    assert demand.words > 2 * -(-len(queries) // pk.PACKET)
+    assert demand.words > 2 * -(-len(queries) // PACKET)
 
 
 def test_exact_limits_suffice_and_one_less_is_told(crowd):

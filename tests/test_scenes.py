@@ -6,6 +6,7 @@ import trimesh
 from ginn_jax import lit_scenes, objects, scenes
 from ginn_jax.dataset import load_cloud
 from ginn_jax.errors import InputError
+from ginn_jax.mesh import add_ground, make_mesh
 from ginn_jax.reference import build_scene
 from ginn_jax.shapes import random_shape
 
@@ -169,6 +170,19 @@ def test_visible_samples_are_of_the_outside_only(tmp_path):
     side += samples.normal[cube, side // 2] > 0
     free = np.delete(np.bincount(side, minlength=6), 2)
     assert free.min() > 0.8 * free.mean()
+
+
+def test_a_sheet_is_sampled_from_both_sides_and_the_ground_from_above():
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
+    sheet = make_mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    scene = build_scene(add_ground(sheet))
+    samples = lit_scenes.visible_samples(scene, 2000, seed=1)
+    ground = samples.material == 1
+    np.testing.assert_allclose(samples.normal[ground], [[0, 1, 0]] * ground.sum())
+    front = samples.normal[~ground, 2] > 0
+    assert 0.4 < front.mean() < 0.6
+    # As dense as the ground: a side has 1 of area, the ground 1.6 squared.
+    assert ground.mean() == pytest.approx(2.56 / 4.56, abs=0.05)
 
 
 def test_a_scene_that_is_sealed_is_refused(tmp_path):

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from experiments.shape_sheet import contact_sheet
-from ginn_jax import reference, sdf, shapes, solids
+from ginn_jax import clad_shapes, reference, sdf, shapes, solids
 from ginn_jax.mesh import add_ground, make_mesh, sample_surface
 
 SEED = st.integers(0, 2**31 - 1)
@@ -27,8 +28,9 @@ def signed_volume(vertices, faces):
     return np.linalg.det(np.asarray(vertices, float)[faces]).sum() / 6
 
 
-def check_shape(mesh):
-    assert_closed(mesh)
+def check_shape(mesh, closed):
+    if closed:
+        assert_closed(mesh)
     assert signed_volume(mesh.vertices, mesh.faces) > 1e-4
     assert len(mesh.faces) <= shapes.MOST_FACES
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
@@ -41,7 +43,8 @@ def test_each_family_is_closed_and_faces_outward(name):
     for seed in range(3):
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # nothing was dropped or turned
-            check_shape(shapes.shape_of(name, np.random.default_rng(seed)))
+            mesh = shapes.shape_of(name, np.random.default_rng(seed))
+        check_shape(mesh, closed=not shapes.FAMILIES[name].clad)
 
 
 @pytest.mark.parametrize("name", shapes.FAMILIES)
@@ -57,11 +60,33 @@ def test_most_of_each_family_is_seen_from_outside(name):
     assert np.mean(seen) > 0.6
 
 
+AXES = hnp.arrays(float, (3, 3), elements=st.floats(-1, 1)).filter(
+    lambda a: abs(np.linalg.det(a)) > 0.05
+)
+
+
+@given(AXES, st.booleans())
+def test_a_plate_faces_outward_and_lacks_its_back_if_open(axes, opened):
+    along, up, out = axes
+    slab = clad_shapes.plate(np.ones(3), along, up, 1.0, out, opened)
+    assert len(slab.faces) == (10 if opened else 12)
+    middle = np.ones(3) + out / 2
+    outward = slab.triangles_center - middle
+    assert ((slab.face_normals * outward).sum(1) > 0).all()
+    back = np.linalg.norm(np.cross(along, up))
+    assert slab.area == pytest.approx(_box_area(axes) - opened * back)
+
+
+def _box_area(axes):
+    sides = [np.cross(axes[i], axes[i - 1]) for i in range(3)]
+    return 2 * sum(np.linalg.norm(side) for side in sides)
+
+
 @settings(max_examples=10, deadline=None)
 @given(SEED)
 def test_random_shapes_are_valid_and_deterministic(seed):
     first, again = shapes.random_shape(seed), shapes.random_shape(seed)
-    check_shape(first)
+    check_shape(first, closed=False)
     for one, other in zip(first, again, strict=True):
         np.testing.assert_array_equal(one, other)
     other = shapes.random_shape(seed + 1)

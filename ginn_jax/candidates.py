@@ -1,0 +1,105 @@
+"""Which points queries may be near: packets of 32 queries share one list of candidates.
+
+Those are the points in the grid columns and layers within the radius of the packet's
+bounding box. Queries may come in any order: a packet that is spread out costs time,
+never an edge. `voxels.morton_order` keeps packets small.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ginn_jax.voxels import (
+    VoxelGrid,
+    cell_of,
+    expand_ranges,
+    narrow_runs,
+    prefix_sum,
+    saturating_sum,
+)
+
+PACKET = 32
+WORD = 32
+
+
+class Columns(NamedTuple):
+    """The block of grid columns under every packet, and the box it may reach into."""
+
+    low: Float[Array, "P 3"]
+    high: Float[Array, "P 3"]
+    first: Int[Array, "P 2"]
+    shape: Int[Array, "P 2"]
+
+
+class Candidates(NamedTuple):
+    """Rows of the grid that each packet reaches: `row[start : start + count]`."""
+
+    row: Int[Array, "C"]
+    start: Int[Array, "P"]
+    count: Int[Array, "P"]
+
+
+def packet_columns(
+    grid: VoxelGrid,
+    query: Float[Array, "M 3"],
+    mask: Bool[Array, "M"],
+    radius: Float[Array, ""],
+) -> tuple[Columns, Int[Array, ""]]:
+    """The columns that each packet has to look into, and how many in all."""
+    far = jnp.float32(jnp.finfo(jnp.float32).max)
+    reach = 1.00001 * radius
+    low = _of_packets(jnp.minimum, jnp.where(mask[:, None], query, far))
+    high = _of_packets(jnp.maximum, jnp.where(mask[:, None], query, -far))
+    empty = low[:, :1] > high[:, :1]
+    low = jnp.where(empty, 0.0, low) - reach
+    high = jnp.where(empty, 0.0, high) + reach
+    first = jnp.stack(
+        [jnp.maximum(cell_of(grid, low[:, a], a), 0) for a in (0, 1)], axis=1
+    )
+    last = [
+        jnp.minimum(cell_of(grid, high[:, a], a), grid.shape[a] - 1) for a in (0, 1)
+    ]
+    shape = jnp.maximum(jnp.stack(last, axis=1) - first + 1, 0)
+    shape = jnp.where(empty, 0, shape)
+    total = saturating_sum(shape[:, 0] * shape[:, 1])
+    return Columns(low, high, first, shape), total
+
+
+def _of_packets(
+    extreme: Callable[[Array, Array], Array], query: Float[Array, "M 3"]
+) -> Float[Array, "P 3"]:
+    """The extreme of each packet by halving: XLA's own reduction is scalar on CPU."""
+    lanes = query.T.reshape(3, -1, PACKET)
+    while lanes.shape[2] > 1:
+        lanes = extreme(*jnp.split(lanes, 2, axis=2))
+    return lanes[:, :, 0].T
+
+
+def packet_candidates(
+    grid: VoxelGrid,
+    under: Columns,
+    columns: int,
+    candidates: int,
+) -> tuple[Candidates, Int[Array, ""]]:
+    """Points in the columns and layers that each packet reaches; how many in all."""
+    area = under.shape[:, 0] * under.shape[:, 1]
+    slots, _ = expand_ranges(jnp.zeros_like(area), area, columns)
+    packet = slots.owner
+    deep = jnp.maximum(under.shape[packet, 1], 1)
+    x, y = under.first[packet].T + jnp.stack([slots.row // deep, slots.row % deep])
+    column = jnp.where(slots.valid, x * grid.shape[1] + y, 0)
+    first = grid.column_start[column]
+    last = jnp.where(slots.valid, grid.column_start[column + 1], first)
+    floor, top = (cell_of(grid, e[packet, 2], 2) for e in (under.low, under.high))
+    start, stop = narrow_runs(grid.layer, first, last, floor, top + 1)
+    count = jnp.zeros(area.size, jnp.int32)
+    count = count.at[packet].add(stop - start, indices_are_sorted=True)
+    found, total = expand_ranges(start, stop - start, candidates)
+    return Candidates(found.row, prefix_sum(count) - count, count), total
+
+
+def count_words(near: Candidates) -> Int[Array, ""]:
+    """How many lists of 32 candidates there are."""
+    return jnp.sum(-(-near.count // WORD), dtype=jnp.int32)
