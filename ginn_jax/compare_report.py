@@ -150,8 +150,14 @@ def draw_front(path: Path, rows: list[Row]) -> None:
         "traced": [r for r in rows if "traced" in r],
         "traced and denoised": [r for r in rows if "denoised" in r],
     }
-    kept = {name: group for name, group in groups.items() if group}
+    kept = {n: [_short(r) for r in group] for n, group in groups.items() if group}
     report.draw_error_against_time(path, kept)
+
+
+def _short(row: Row) -> Row:
+    """A row whose label leaves out what its line in the figure says."""
+    name = row["method"].removeprefix(f"{OURS}, ").removesuffix(", denoised")
+    return row | {"method": name}
 
 
 def draw_methods(

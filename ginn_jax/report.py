@@ -147,15 +147,18 @@ def draw_error_against_time(
         seconds = [1e3 * row["seconds"] for row in ordered]
         errors = [max(row["mse_2d"], 1e-7) for row in ordered]
         axes.plot(seconds, errors, "o-", label=name)
-        for row, x, y in zip(ordered, seconds, errors, strict=True):
+        for i, (row, x, y) in enumerate(zip(ordered, seconds, errors, strict=True)):
+            side = 1 if i % 2 == 0 else -1  # neighbours' labels keep clear
             axes.annotate(
                 row["method"],
                 (x, y),
                 fontsize=7,
-                xytext=(4, 4),
+                xytext=(4 * side, 4 * side),
                 textcoords="offset points",
+                ha="left" if side > 0 else "right",
+                va="bottom" if side > 0 else "top",
             )
     axes.set(xlabel="ms per image", ylabel="2D MSE", xscale="log", yscale="log")
     axes.grid(alpha=0.3)
-    axes.legend()
+    figure.legend(loc="outside upper center", ncols=3, fontsize=8)
     figure.savefig(path, dpi=140)
