@@ -63,9 +63,9 @@ class Options:
     """A mesh file or a folder of meshes; without it procedural shapes."""
     shapes: int = 2
     """Procedural shapes, of seeds that training does not use."""
-    radii: tuple[float, ...] = (0.01, 0.015, 0.02, 0.03)
+    radii: tuple[float, ...] = (0.01, 0.015, 0.02, 0.025)
     """Poisson disk radii, in units of the object's longest side."""
-    points: int = 20_000
+    points: int = 32_000
     """Samples of an object before the disk; few of them starve the small radii."""
     resolution: int = 512
     """Side of the image in pixels."""

@@ -82,9 +82,9 @@ class Options:
     """Rays or paths per pixel of the reference."""
     counts: tuple[int, ...] = (1, 4, 16, 64)
     """Rays or paths per pixel of the traced rivals."""
-    disks: tuple[float, ...] = (0.015, 0.03)
-    """Poisson disk radii at which our network runs beside its own."""
-    points: int = 20_000
+    disks: tuple[float, ...] = (0.75, 1.5)
+    """Poisson disk radii at which our network runs beside its own, as times that."""
+    points: int = 32_000
     """Samples per object; a fifth of them measure, the others are given."""
     radius: float = 0.1
     """Occlusion radius."""
@@ -219,10 +219,11 @@ def rivals(
         "ours, scale 0.5", networks[OURS], given, shot, 0.5
     )
     rows = [picture.row]
-    for radius in options.disks:
+    for times in options.disks:
+        radius = times * network.levels[0]
         variant = with_disk_radius(network, radius)
         trained = variant, limits_at(network, limits, radius), model
-        name = f"ours, disk {radius:g}"
+        name = f"ours, disk {radius:.3g}"
         rows.append(network_picture(name, trained, given, shot)[0].row)
     for count in options.counts:
         seed = 1_000_003 + options.seed
