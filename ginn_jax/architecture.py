@@ -51,6 +51,8 @@ class Network:
     hidden      width of the kernel perceptrons
     group       kernel values per perceptron: the paper's blocks; 0 for one shared block
     oriented    whether kernels see normals beside offsets
+    sided       whether surfaces that face away from each other are apart, however near:
+                Poisson disks and areas are then of one side of a thin wall
     density     how senders are weighted, see `receptive_field`
     norm        "batch" with running moments, "layer" over channels, or "none"
     materials   numbers of the material that a point comes with, such as its albedo
@@ -71,6 +73,7 @@ class Network:
     hidden: int = 16
     group: int = 0
     oriented: bool = True
+    sided: bool = False
     density: Literal["kde", "surface"] = "surface"
     norm: Literal["batch", "layer", "none"] = "layer"
     materials: int = 0
@@ -220,7 +223,7 @@ def with_ablations(network: Network) -> dict[str, Network]:
 
 
 # Creases are dark over a hundredth of the object: finer points than light needs.
-DEFAULT = compact_network(levels=(0.015, 0.04, 0.1), query_radius=0.0275)
+DEFAULT = compact_network(levels=(0.015, 0.04, 0.1), query_radius=0.0275, sided=True)
 PRESETS = {"default": DEFAULT, "paper": PAPER, "released": RELEASED}
 PRESETS |= with_ablations(DEFAULT)
 

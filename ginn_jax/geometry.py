@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int, Key
 
 from ginn_jax.architecture import Conv, Network
-from ginn_jax.hierarchy import Level, LevelLimit, build_level, draw_lots
+from ginn_jax.hierarchy import Level, LevelLimit, build_level, draw_lots, same_side
 from ginn_jax.limits import Demands, Limits
 from ginn_jax.packets import Demand, EdgeLimit, Edges, radius_edges
 from ginn_jax.receptive_field import (
@@ -163,9 +163,7 @@ def build_geometry(
     if needs_areas(config):
         conv = area_search(config)
         edges, more = search(conv, limits, grid_of(config, grids, 0, finest), finest)
-        areas[0] = point_area(
-            finest.position, finest.mask, edges, jnp.float32(conv.radius)
-        )
+        areas[0] = _areas(config, finest, edges, conv.radius)
         demands |= more
     fields = {}
     for conv in config.encoder:
@@ -233,6 +231,7 @@ def _build_levels(
             jnp.float32(radius),
             LevelLimit(EdgeLimit(*searched), kept),
             lots[names],
+            config.sided,
         )
         names = names[level.index]
         demands |= dict(zip(parts, (*demand.search, demand.points), strict=True))
@@ -250,11 +249,15 @@ def _level_areas(
         return {}
     within = {c.source: c for c in config.encoder if c.source == c.target}
     return {
-        i: point_area(
-            levels[i].position, levels[i].mask, found[c.name], jnp.float32(c.radius)
-        )
-        for i, c in within.items()
+        i: _areas(config, levels[i], found[c.name], c.radius) for i, c in within.items()
     }
+
+
+def _areas(config: Network, points: Oriented, edges: Edges, radius: float) -> Array:
+    """The area that each point stands for, of its own side if the network tells."""
+    counted = same_side(points.normal, edges) if config.sided else None
+    ends = points.position, points.mask, edges
+    return point_area(*ends, jnp.float32(radius), counted)
 
 
 def build_query_field(

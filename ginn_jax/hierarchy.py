@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from ginn_jax.neighbors import bucket, find_neighbors
-from ginn_jax.packets import Demand, EdgeLimit, radius_edges
+from ginn_jax.packets import Demand, EdgeLimit, Edges, radius_edges
 from ginn_jax.voxels import VoxelGrid, compact
 
 WAITING, DROPPED, KEPT = 1, 0, 2
@@ -40,9 +40,14 @@ class Level(NamedTuple):
 
 
 def elect(
-    sender: Int[Array, "E"], receiver: Int[Array, "E"], mask: Bool[Array, "N"]
+    sender: Int[Array, "E"],
+    receiver: Int[Array, "E"],
+    mask: Bool[Array, "N"],
+    conflict: Bool[Array, "E"] | None = None,
 ) -> Bool[Array, "N"]:
     """Points that survive, given edges from each point's conflicting betters to it.
+
+    `conflict` says which edges count; without it all do.
 
     A point is kept once all its betters are dropped and dropped once one is kept, so
     the outcome is that of sequential dart throwing in priority order, found in a number
@@ -52,9 +57,10 @@ def elect(
     count = mask.shape[0]
 
     def settle(state: Int[Array, "N"]) -> Int[Array, "N"]:
-        best = jax.ops.segment_max(
-            state[sender], receiver, count, indices_are_sorted=True
-        )
+        better = state[sender]
+        if conflict is not None:
+            better = jnp.where(conflict, better, DROPPED)
+        best = jax.ops.segment_max(better, receiver, count, indices_are_sorted=True)
         settled = jnp.where(
             best == KEPT, DROPPED, jnp.where(best < WAITING, KEPT, WAITING)
         )
@@ -74,16 +80,26 @@ def sample_disk(
     radius: Float[Array, ""],
     limit: EdgeLimit,
     lot: UInt32[Array, "N"],
+    normal: Float[Array, "N 3"] | None = None,
 ) -> tuple[Bool[Array, "N"], Demand]:
     """Maximal subset with pairwise distance >= radius, greedy in the order of lots.
 
     The parallel Poisson disk sampling of the paper's section "3D Step". `grid` holds
-    the same points. If the demand exceeds the limit the subset is not valid.
+    the same points. Given normals, points that face away from each other may be nearer.
+    If the demand exceeds the limit the subset is not valid.
     """
     edges = radius_edges(
         grid, position, mask, radius, limit, lambda s, r: beats(lot, s, r)
     )
-    return elect(edges.sender, edges.receiver, mask), edges.demand
+    conflict = None if normal is None else same_side(normal, edges)
+    return elect(edges.sender, edges.receiver, mask, conflict), edges.demand
+
+
+def same_side(normal: Float[Array, "N 3"], edges: Edges) -> Bool[Array, "E"]:
+    """Whether the ends of edges within a cloud do not face away from each other."""
+    ends = jnp.minimum(edges.receiver, normal.shape[0] - 1)
+    x, y, z = (axis[edges.sender] * axis[ends] for axis in normal.T)
+    return x + y + z >= 0
 
 
 def draw_lots(count: int, *, key: Key[Array, ""]) -> UInt32[Array, "N"]:
@@ -109,9 +125,14 @@ def build_level(
     radius: Float[Array, ""],
     limit: LevelLimit,
     lot: UInt32[Array, "N"],
+    sided: bool = False,
 ) -> tuple[Level, LevelDemand]:
-    """One Poisson disk step; rows beyond the kept ones are zero and masked out."""
-    kept, search = sample_disk(grid, position, mask, radius, limit.search, lot)
+    """One Poisson disk step; rows beyond the kept ones are zero and masked out.
+
+    With `sided`, points that face away from each other may be nearer than `radius`.
+    """
+    sides = normal if sided else None
+    kept, search = sample_disk(grid, position, mask, radius, limit.search, lot, sides)
     index, real, points = compact(kept, limit.points)
     level = Level(
         jnp.where(real[:, None], position[index], 0.0),

@@ -210,14 +210,16 @@ def point_area(
     mask: Bool[Array, "N"],
     edges: Edges,
     radius: Float[Array, ""],
+    counted: Bool[Array, "E"] | None = None,
 ) -> Float[Array, "N"]:
     """Area each point stands for, from the edges of the cloud with itself.
 
     The inverse of a density by the quartic kernel (1 - d^2 / r^2)^2, whose integral
-    over a flat surface is pi r^2 / 3.
+    over a flat surface is pi r^2 / 3. The density is of the edges that are `counted`.
     """
     offset, real = edge_offsets(position, position, edges)
     value = (1 - jnp.sum(offset**2, axis=0) / radius**2) ** 2
+    real = real if counted is None else real & counted
     total = jax.ops.segment_sum(
         jnp.where(real, value, 0.0),
         edges.receiver,

@@ -20,11 +20,20 @@ def neighbors(points, queries, radius):
     ]
 
 
-def dart_throwing(points, radius, lots):
-    """Throw points in order of their lots; each stays unless an earlier one is near."""
+def dart_throwing(points, radius, lots, normals=None):
+    """Throw points in order of their lots; each stays unless an earlier one is near.
+
+    Given normals, what faces the other way is never near.
+    """
+
+    def near(i, k):
+        if normals is not None and float(np.dot(normals[i], normals[k])) < 0:
+            return False
+        return distance(points[i], points[k]) < radius
+
     kept = []
     for i in sorted(range(len(points)), key=lambda i: (int(lots[i]), i)):
-        if all(distance(points[i], points[k]) >= radius for k in kept):
+        if not any(near(i, k) for k in kept):
             kept.append(i)
     return sorted(kept)
 

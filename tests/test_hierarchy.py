@@ -22,8 +22,8 @@ FEWER = settings(max_examples=12)
 FULL = hi.LevelLimit(ALL_PAIRS, POINTS)
 
 
-@partial(jax.jit, static_argnames="limit")
-def build(cloud, normal, radius, seed, limit):
+@partial(jax.jit, static_argnames=("limit", "sided"))
+def build(cloud, normal, radius, seed, limit, sided=False):
     grid = build_grid(*cloud, radius)
     key = jax.random.key(seed)
     position, mask = cloud
@@ -35,6 +35,7 @@ def build(cloud, normal, radius, seed, limit):
         radius,
         limit,
         hi.draw_lots(len(position), key=key),
+        sided,
     )
 
 
@@ -101,6 +102,19 @@ def test_jitted_sample_equals_dart_throwing(cloud, seed):
     lots = np.asarray(hi.draw_lots(POINTS, key=jax.random.key(seed)))[rows]
     expected = rows[dart_throwing(points, 0.297, lots)]
     np.testing.assert_array_equal(disk(cloud, 0.297, seed), expected)
+
+
+@given(padded(), SEEDS, st.integers(0, 2**POINTS - 1))
+def test_sided_sample_equals_dart_throwing_of_sides(cloud, seed, sides):
+    """Each point looks up or down, a little aslant."""
+    up = [1.0 if sides >> i & 1 else -1.0 for i in range(POINTS)]
+    normal = np.stack([np.full(POINTS, 0.6), np.zeros(POINTS), up], 1, dtype=np.float32)
+    normal *= np.float32([0.5, 1, 0.8])
+    level, _ = build(cloud, normal, np.float32(0.297), seed, FULL, sided=True)
+    points, rows = cloud.real()
+    lots = np.asarray(hi.draw_lots(POINTS, key=jax.random.key(seed)))[rows]
+    expected = rows[dart_throwing(points, 0.297, lots, normal[rows])]
+    np.testing.assert_array_equal(level.index[level.mask], expected)
 
 
 @pytest.mark.parametrize("lots", [[5, 5, 5, 5], [3, 2, 2, 3]])

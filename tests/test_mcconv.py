@@ -16,6 +16,7 @@ from strategies import ALL_PAIRS, POINTS, QUERIES, SEEDS, UNIT, lattice, pad
 
 from ginn_jax import mcconv as mc
 from ginn_jax import receptive_field as rf
+from ginn_jax.hierarchy import same_side
 from ginn_jax.packets import EdgeLimit, radius_edges
 from ginn_jax.voxels import build_grid
 
@@ -388,21 +389,42 @@ def test_density_tells_how_many_pairs_it_needs(dense_case):
 
 
 @jax.jit
-def area_of(position, radius):
+def area_of(position, radius, normal=None):
     mask = jnp.ones(position.shape[0], bool)
     grid = build_grid(position, mask, radius)
     limit = EdgeLimit(1 << 14, 1 << 18, 1 << 12, 1 << 17)
     edges = radius_edges(grid, position, mask, radius, limit)
-    return rf.point_area(position, mask, edges, radius), edges.demand
+    counted = None if normal is None else same_side(normal, edges)
+    area = rf.point_area(position, mask, edges, radius, counted)
+    return area, edges.demand
+
+
+def flat_square(side):
+    """Places in the unit square, evenly spread, and the points at height .3."""
+    rng = np.random.default_rng(8)
+    place = (np.indices((side, side)).reshape(2, -1).T + 0.5) / side
+    place += rng.uniform(-0.2, 0.2, place.shape) / side
+    return place, np.insert(place, 1, 0.3, axis=1).astype(np.float32)
+
+
+def test_area_of_either_side_of_a_sheet():
+    """What faces away does not count: each side has the area of the sheet alone."""
+    _, above = flat_square(20)
+    below = np.float32([[0.003, 0.296, 0.002]]) + above * [1, 0, 1]
+    position = np.concatenate([above, below]).astype(np.float32)
+    normal = np.repeat(np.float32([[0, 1, 0], [0, -1, 0]]), len(above), axis=0)
+    radius = np.float32(0.2)
+    both, demand = area_of(position, radius, normal)
+    assert demand.edges <= 1 << 17
+    alone, _ = area_of(np.concatenate([above, above + np.float32(9)]), radius)
+    np.testing.assert_allclose(both[: len(above)], alone[: len(above)], rtol=1e-5)
+    np.testing.assert_allclose(both[len(above) :], alone[: len(above)], rtol=1e-3)
 
 
 def test_area_of_a_flat_square():
     """Inside it every point stands for 1 / density, and together for the area."""
     side, radius = 40, 0.12
-    rng = np.random.default_rng(8)
-    place = (np.indices((side, side)).reshape(2, -1).T + 0.5) / side
-    place += rng.uniform(-0.2, 0.2, place.shape) / side
-    position = np.insert(place, 1, 0.3, axis=1).astype(np.float32)
+    place, position = flat_square(side)
     area, demand = area_of(position, np.float32(radius))
     assert demand.candidates <= 1 << 18
     assert demand.edges <= 1 << 17
