@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import tiny
 
-from ginn_jax.architecture import DEFAULT
+from ginn_jax.architecture import compact_network
 from ginn_jax.disk_radius import limits_at, with_disk_radius
 from ginn_jax.errors import InputError
 from ginn_jax.image import SLACK
@@ -31,7 +31,7 @@ def test_disk_radius_beyond_level_1_is_refused():
         with_disk_radius(network, 0.12)
 
 
-# What the default network needed of 20,000 samples of a procedural shape, and of 16,384
+# What the compact network needed of 20,000 samples of a procedural shape, and of 16,384
 # pixels, at disk radii .015, .02 and .03.
 DEMANDS = {
     "level_0": {
@@ -74,7 +74,7 @@ def test_limits_at_another_radius_are_those_that_suffice(radius, column):
     """Those of radius .02, with the usual slack, made into those of another."""
     found = {f"{s}.{p}": n for s, parts in DEMANDS.items() for p, n in parts.items()}
     usual = limits_for({name: n[1] for name, n in found.items()}, SLACK)
-    scaled = limits_at(DEFAULT, usual, radius)
+    scaled = limits_at(compact_network(), usual, radius)
     assert set(dict(scaled.sizes)) == set(found)
     for name, demands in found.items():
         size = scaled.of(name)
@@ -83,4 +83,4 @@ def test_limits_at_another_radius_are_those_that_suffice(radius, column):
 
 def test_other_limits_do_not_go_with_the_radius():
     limits = Limits((("level_2.edges", 640), ("conv_1.edges", 4096)))
-    assert limits_at(DEFAULT, limits, 0.01) == limits
+    assert limits_at(compact_network(), limits, 0.01) == limits
