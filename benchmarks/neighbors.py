@@ -112,12 +112,15 @@ def compare(options: Options, cloud: str, radius: float, count: int) -> dict[str
         if not same_but_for_rounding(expected, found, points, queries, radius):
             raise AssertionError(f"{name} found other pairs: {cloud}, r = {radius}")
     calls = {n: partial(s, points, queries, radius) for n, s in searches.items()}
+    timings = measure(calls, options.repeats)
+    told = ", ".join(f"{name} {timing}" for name, timing in timings.items())
+    print(f"{cloud}, {count} queries, r = {radius}: {told}", flush=True)
     return {
         "cloud": cloud,
         "queries": count,
         "radius": radius,
         "pairs": len(expected[0]),
-        "timings": measure(calls, options.repeats),
+        "timings": timings,
     }
 
 
