@@ -17,7 +17,6 @@ from rich.console import Console
 
 from ginn_jax import architecture, evaluate, fit, objects, report, scenes
 from ginn_jax.commandline import require_positive, start
-from ginn_jax.dataset import count_given
 from ginn_jax.disk_radius import limits_at, with_disk_radius
 from ginn_jax.experiment import (
     Clock,
@@ -185,7 +184,7 @@ def image_evaluation(
             with_disk_radius(network, radius),
         )
         for (source, whole), view in zip(shown, views, strict=True):
-            cloud = evaluate.split_cloud(whole, count_given(len(whole.position)))[0]
+            cloud = evaluate.split_cloud(whole)[0]
             row, image, held = evaluate.network_row(variant, held, model, cloud, view)
             rows.append(row | {"name": source.name})
             if radius == own:

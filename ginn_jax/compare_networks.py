@@ -57,10 +57,9 @@ def load_networks(
 
 def points_given(cloud: Any) -> tuple[Any, np.ndarray | None]:
     """The part of a cloud that networks are given, and the units of its light."""
-    count = count_given(len(cloud.position))
     if not isinstance(cloud, LitCloud):
-        return evaluate.split_cloud(cloud, count)[0], None
-    given = split_points(cloud, count)[0]
+        return evaluate.split_cloud(cloud)[0], None
+    given = split_points(cloud, count_given(len(cloud.position)))[0]
     return given, mean_light(given)
 
 

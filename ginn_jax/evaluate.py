@@ -60,7 +60,7 @@ def evaluate_clouds(
     """
     rows = []
     for name, cloud in zip(names, clouds, strict=True):
-        given, asked = split_cloud(cloud, count_given(len(cloud.position)))
+        given, asked = split_cloud(cloud)
         encoded, limits = encode_cloud(
             network,
             limits,
@@ -89,8 +89,9 @@ def evaluate_clouds(
     return rows, limits
 
 
-def split_cloud(cloud: ShadedPoints, count: int) -> tuple[ShadedPoints, ShadedPoints]:
-    """The first `count` points and the others."""
+def split_cloud(cloud: ShadedPoints) -> tuple[ShadedPoints, ShadedPoints]:
+    """The points that a network is given, and those at which it is asked."""
+    count = count_given(len(cloud.position))
     first = jax.tree.map(lambda a: a[:count], cloud)
     return first, jax.tree.map(lambda a: a[count:], cloud)
 

@@ -84,9 +84,14 @@ _PILED = ["blob", "carving", "shell", "vase", "tower", "cloth", "bars", "vehicle
 def random_shape(seed: int) -> Mesh:
     """Shape number `seed` (>= 0): faces look outward, unit box, +y up."""
     rng = np.random.default_rng(whole("seed", seed, 0, 2**63 - 1))
-    weight = np.array([family.weight for family in FAMILIES.values()])
-    name = rng.choice(list(FAMILIES), p=weight / weight.sum())
+    name = draw_family(rng)
     return shape_of(name, rng)
+
+
+def draw_family(rng: np.random.Generator) -> str:
+    """The name of a family, each drawn as often as its weight says."""
+    weight = np.array([family.weight for family in FAMILIES.values()])
+    return str(rng.choice(list(FAMILIES), p=weight / weight.sum()))
 
 
 def shape_of(name: str, rng: np.random.Generator) -> Mesh:
