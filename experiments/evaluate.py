@@ -30,7 +30,7 @@ from ginn_jax.compare_networks import (
 )
 from ginn_jax.compare_screen import screen_pictures
 from ginn_jax.compare_tracing import denoised_picture, traced_picture, with_reference
-from ginn_jax.dataset import count_given
+from ginn_jax.dataset import count_asked, count_given
 from ginn_jax.disk_radius import limits_at, with_disk_radius
 from ginn_jax.evaluate import Row
 from ginn_jax.experiment import make
@@ -111,9 +111,7 @@ def main(options: Options) -> dict[str, Any]:
     key = jax.random.key(options.seed)
     networks = load_networks(options.effect, runs, key=key)
     if not isinstance(settings, Occlusion):
-        settings = replace(
-            settings, targets=options.points - count_given(options.points)
-        )
+        settings = replace(settings, targets=count_asked(options.points))
     clouds = make(console, "clouds", sources, settings, options.out / "clouds")
     at_points, networks = errors_at_points(networks, clouds, sources, settings)
     rows, front_rows, shown = [], [], []

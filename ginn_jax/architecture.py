@@ -228,7 +228,10 @@ PRESETS = {"default": DEFAULT, "paper": PAPER, "released": RELEASED}
 PRESETS |= with_ablations(DEFAULT)
 
 # Light goes further than occlusion, hence a level more.
-_WIDE = compact_network(k=16, levels=(0.02, 0.05, 0.1, 0.2), lights=1)
+_FAR = {"k": 16, "lights": 1, "sided": True}
+_DIFFUSE = compact_network(levels=(0.02, 0.05, 0.1, 0.2), materials=1, **_FAR)
+# Most media are dense: light leaves them near to where it entered.
+_DENSE = compact_network(levels=(0.015, 0.04, 0.1, 0.2), query_radius=0.0275, **_FAR)
 
 
 def for_light(network: Network) -> dict[str, Network]:
@@ -247,6 +250,6 @@ def for_light(network: Network) -> dict[str, Network]:
 
 
 # The albedo of a point and what it sends out.
-ILLUMINATION = for_light(replace(_WIDE, materials=1))
+ILLUMINATION = for_light(_DIFFUSE)
 # Albedo, extinction and index of refraction, and the irradiance.
-SCATTERING = for_light(replace(_WIDE, materials=3, asks="all", local=True))
+SCATTERING = for_light(replace(_DENSE, materials=3, asks="all", local=True))

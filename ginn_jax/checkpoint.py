@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import asdict
 from functools import partial
@@ -24,6 +24,7 @@ from ginn_jax.train import Training, TrainState, state_shapes
 
 KEPT = 2
 CHECKPOINTS, RECORD = "checkpoints", "run.json"
+UNSPENT = {"compile": 0.0, "train": 0.0}
 
 
 def open_manager(folder: Path, fresh: bool = False) -> ocp.CheckpointManager:
@@ -123,17 +124,24 @@ def _shape_of(leaf: Any) -> jax.ShapeDtypeStruct:
 
 
 def save_run(
-    folder: Path, config: Training, limits: Limits, extra: dict[str, Any]
+    folder: Path,
+    config: Training,
+    limits: Limits,
+    extra: dict[str, Any],
+    seconds: Mapping[str, float] = UNSPENT,
 ) -> None:
-    """Write what a resumed run must agree with: configuration and capacities."""
+    """Write what a resumed run must agree with, its capacities and the time spent."""
     record = {"training": asdict(config), "limits": dict(limits.sizes), **extra}
+    record["seconds"] = dict(seconds)
     text = json.dumps(record, indent=1, sort_keys=True)
     with writing(folder / RECORD) as new:
         new.write_text(text)
 
 
-def load_run(folder: Path, config: Training, extra: dict[str, Any]) -> Limits:
-    """The capacities of the run to be resumed.
+def load_run(
+    folder: Path, config: Training, extra: dict[str, Any]
+) -> tuple[Limits, dict[str, float]]:
+    """Capacities of the run to be resumed, and the seconds it took by purpose.
 
     Raises:
         InputError: no run there, an unreadable record, or other settings than now.
@@ -143,6 +151,7 @@ def load_run(folder: Path, config: Training, extra: dict[str, Any]) -> Limits:
     with damaged(path, "delete it and start anew"):
         training = dict(record["training"])
         limits = limits_from(record)
+        seconds = {name: float(record["seconds"][name]) for name in UNSPENT}
     wanted = json.loads(json.dumps({"training": asdict(config), **extra}))
     for name in sorted(wanted["training"]):
         if training.get(name) != wanted["training"][name]:
@@ -155,7 +164,7 @@ def load_run(folder: Path, config: Training, extra: dict[str, Any]) -> Limits:
                 f"{path} was made with another {name}: resume with the same"
             )
     check_names(path, config.network, limits)
-    return limits
+    return limits, seconds
 
 
 def check_names(path: Path, network: Network, limits: Limits) -> None:

@@ -43,6 +43,11 @@ def count_given(points: int) -> int:
     return points * 4 // 5
 
 
+def count_asked(points: int) -> int:
+    """At how many of a cloud's samples, the last ones, a network is asked."""
+    return points - count_given(points)
+
+
 def save_cloud(path: Path, cloud: ShadedPoints, origin: dict[str, Any]) -> None:
     """Write a cloud and what made it, atomically: a killed run leaves no half file."""
     arrays = {name: a for name, a in cloud._asdict().items() if a is not None}

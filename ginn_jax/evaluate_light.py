@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from ginn_jax.architecture import Network
 from ginn_jax.camera import Camera, orbit_camera
-from ginn_jax.dataset import count_given
+from ginn_jax.dataset import count_asked
 from ginn_jax.evaluate import Model, Row, timed
 from ginn_jax.image import Encoded, encode_cloud, shade_image, shade_points
 from ginn_jax.irradiance import ColorEstimate
@@ -71,7 +71,7 @@ def evaluate_lit_clouds(
     The other points are the network's input.
     """
     rows = []
-    targets = settings.targets or settings.points - count_given(settings.points)
+    targets = settings.targets or count_asked(settings.points)
     for name, cloud in zip(names, clouds, strict=True):
         given, asked = split_points(cloud, len(cloud.position) - targets)
         encoded, limits = encode_lit(network, limits, model, given)

@@ -18,7 +18,7 @@ from rich.progress import (
 from ginn_jax import fit, report, scenes
 from ginn_jax.architecture import Network
 from ginn_jax.commandline import require, require_positive
-from ginn_jax.dataset import count_given
+from ginn_jax.dataset import count_asked, count_given
 from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import Cloud
 from ginn_jax.objects import Source
@@ -144,7 +144,7 @@ def training(
         steps=options.steps,
         batch_size=options.batch,
         points=count_given(points),
-        queries=points - count_given(points),
+        queries=count_asked(points),
         learning_rate=options.learning_rate,
         schedule=options.schedule,
         epoch_steps=max(clouds // options.batch, 1),

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from ginn_jax.checkpoint import (
+    UNSPENT,
     finish,
     load_run,
     open_manager,
@@ -47,7 +48,10 @@ class Schedule:
 
 
 class Fit(NamedTuple):
-    """A finished run: state, capacities, loss of every step, seconds by purpose."""
+    """A finished run: state, capacities, loss of every step, seconds by purpose.
+
+    Losses and seconds are of the whole run, however often it was resumed.
+    """
 
     state: TrainState
     limits: Limits
@@ -80,16 +84,16 @@ def fit(
     folder.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
     if resume:
-        limits = load_run(folder, config, extra or {})
+        limits, seconds = load_run(folder, config, extra or {})
     else:
-        limits = training_limits(config, clouds)
-        save_run(folder, config, limits, extra or {})
+        limits, seconds = training_limits(config, clouds), dict(UNSPENT)
+        save_run(folder, config, limits, extra or {}, seconds)
     manager = open_manager(folder, fresh=not resume)
     state = init_state(config)
     losses = np.zeros(0, np.float32)
     if resume and (found := restore_state(manager, state)) is not None:
         state, losses = found, load_losses(folder, int(found.step))
-    seconds = {"compile": time.perf_counter() - start, "train": 0.0}
+    seconds["compile"] += time.perf_counter() - start
     history: list[float] = losses.tolist()
     raised: dict[str, int] = {}
     compiled_for = None
@@ -113,7 +117,7 @@ def fit(
             progress(step + 1, recent_loss(history, schedule.report), "")
         if (step + 1) % schedule.save == 0 or step + 1 == config.steps:
             save_losses(folder, history)
-            save_run(folder, config, limits, extra or {})
+            save_run(folder, config, limits, extra or {}, seconds)
             save_state(manager, state)
     finish(manager)
     return Fit(state, limits, np.array(history, np.float32), seconds, raised)

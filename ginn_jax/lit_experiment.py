@@ -12,7 +12,7 @@ from rich.console import Console
 
 from ginn_jax import evaluate_light, fit, report
 from ginn_jax.architecture import Network
-from ginn_jax.dataset import count_given
+from ginn_jax.dataset import count_asked, count_given
 from ginn_jax.evaluate import Model, mean_rows
 from ginn_jax.experiment import (
     Clock,
@@ -89,9 +89,7 @@ def run_experiment(
     folder = options.out / "data"
     clouds = make(console, "training clouds", seen, settings, folder / "training")
     paths = max(settings.paths, VALIDATION_PATHS)
-    exact = replace(
-        settings, paths=paths, targets=settings.points - count_given(settings.points)
-    )
+    exact = replace(settings, paths=paths, targets=count_asked(settings.points))
     exact = exact if not options.quick else replace(exact, paths=16)
     tests = {
         name: make(console, f"unseen, {name}", sources, exact, folder / name)

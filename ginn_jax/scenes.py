@@ -15,7 +15,9 @@ from ginn_jax.mesh import Mesh
 from ginn_jax.objects import Source, load_object, origin_of
 from ginn_jax.reference import ambient_occlusion, build_scene
 
-# Bounds what a renderer could leak in one process.
+# Bounds what a renderer could leak in one process. Not by `max_tasks_per_child`, with
+# which a pool may wait forever for a process that it does not start (python/cpython
+# #115634).
 SCENES_PER_WORKER = 200
 FORMAT = 4
 
@@ -82,16 +84,22 @@ def make_clouds(
     What `folder` already holds is kept, so a killed run goes on where it was.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    jobs = {cloud_path(folder, source): source for source in sources}
+    jobs = list({cloud_path(folder, source): source for source in sources}.items())
+    workers = min(workers, max(len(jobs), 1))
+    size = workers * SCENES_PER_WORKER
+    for first in range(0, len(jobs), size):
+        yield from _run_jobs(jobs[first : first + size], settings, workers)
+
+
+def _run_jobs(
+    jobs: Sequence[tuple[Path, Source]], settings: Settings, workers: int
+) -> Iterator[Path]:
+    """Make these clouds in processes of their own."""
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(
-        min(workers, max(len(jobs), 1)),
-        mp_context=context,
-        max_tasks_per_child=SCENES_PER_WORKER,
-    ) as pool:
+    with ProcessPoolExecutor(workers, mp_context=context) as pool:
         done = {
             pool.submit(make_cloud, source, settings, path): path
-            for path, source in jobs.items()
+            for path, source in jobs
         }
         try:
             for future in as_completed(done):

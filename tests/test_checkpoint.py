@@ -13,6 +13,7 @@ from ginn_jax.errors import InputError
 CONFIG = replace(tiny.CONFIG, network=tiny.ONE_LEVEL)
 LIMITS = tiny.ONE_LEVEL_LIMITS
 EXTRA = {"clouds": 12, "rays": 64}
+SECONDS = {"compile": 31.5, "train": 280.0}
 
 
 pytestmark = pytest.mark.usefixtures("cheap_compiling")
@@ -118,13 +119,14 @@ def test_checkpoint_of_another_network_is_refused(third, tmp_path):
 @pytest.fixture
 def recorded(tmp_path):
     """A folder with the record of a run."""
-    checkpoint.save_run(tmp_path, CONFIG, LIMITS, EXTRA)
+    checkpoint.save_run(tmp_path, CONFIG, LIMITS, EXTRA, SECONDS)
     return tmp_path
 
 
 def test_record_comes_back(recorded):
-    limits = checkpoint.load_run(recorded, CONFIG, EXTRA)
+    limits, seconds = checkpoint.load_run(recorded, CONFIG, EXTRA)
     assert dict(limits.sizes) == dict(LIMITS.sizes)
+    assert seconds == SECONDS
     assert [p.name for p in recorded.iterdir()] == ["run.json"]
 
 
@@ -169,6 +171,7 @@ def test_no_record_is_refused(tmp_path):
         lambda text: text.replace('"limits"', '"limit"'),
         lambda text: json.dumps(json.loads(text) | {"limits": {"a": None}}),
         lambda text: json.dumps(json.loads(text) | {"training": 3}),
+        lambda text: json.dumps(json.loads(text) | {"seconds": {"train": "long"}}),
     ],
 )
 def test_damaged_record_is_refused(recorded, damage):

@@ -137,6 +137,30 @@ def test_workers_make_the_same_and_keep_what_is_done(sources, made, tmp_path):
     assert contents(tmp_path / "new") == before
 
 
+def test_no_process_makes_more_than_its_share(monkeypatch, tmp_path):
+    """A pool that replaces its processes as they tire may wait for one forever."""
+    pools = []
+
+    class Pool(tiny.Here):
+        def __init__(self, workers, mp_context):
+            pools.append((workers, []))
+
+        def submit(self, function, source, settings, path):
+            pools[-1][1].append(source.name)
+            return super().submit(path.touch)
+
+    monkeypatch.setattr(scenes, "ProcessPoolExecutor", Pool)
+    monkeypatch.setattr(scenes, "SCENES_PER_WORKER", 3)
+    many = objects.procedural_sources(14, 0)
+    done = list(scenes.make_clouds(many, SETTINGS, tmp_path, 2))
+    assert sorted(done) == sorted(scenes.cloud_path(tmp_path, s) for s in many)
+    assert [(workers, len(names)) for workers, names in pools] == [
+        (2, 6),
+        (2, 6),
+        (2, 2),
+    ]
+
+
 def test_missing_mesh_is_refused(tmp_path):
     [source] = objects.file_sources([tmp_path / "gone.ply"])
     with pytest.raises(InputError, match=r"^[^\n]*gone\.ply[^\n]*$"):

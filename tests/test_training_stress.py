@@ -4,6 +4,7 @@ Run as a script it trains into a folder, resuming what it finds there, and at a 
 that is asked for it kills itself as the kernel would: SIGKILL, no handler, no flush.
 """
 
+import json
 import os
 import shutil
 import signal
@@ -204,6 +205,18 @@ def test_killed_run_ends_as_an_unbroken_one(unbroken):
     check_killed(unbroken.parent / "killed", unbroken, MOMENTS)
 
 
+def test_time_spent_before_counts(unbroken):
+    folder = unbroken.parent / "earlier"
+    shutil.copytree(unbroken, folder)
+    path = folder / checkpoint.RECORD
+    record = json.loads(path.read_text())
+    assert record["seconds"]["train"] > 0
+    path.write_text(json.dumps(record | {"seconds": {"compile": 1e6, "train": 2e6}}))
+    found = train(folder, [cloud(seed) for seed in range(3)], True)
+    assert found.seconds["train"] == 2e6
+    assert found.seconds["compile"] > 1e6
+
+
 def test_part_of_a_checkpoint_is_ignored_or_named(unbroken):
     """Half a checkpoint under a temporary name is nothing; under its own it is told."""
     folder = unbroken.parent / "half"
@@ -217,11 +230,11 @@ def test_part_of_a_checkpoint_is_ignored_or_named(unbroken):
         checkpoint.load_weights(folder)
 
 
-if __name__ == "__main__":
-    main(*sys.argv[1:])
-
-
 def test_progress_leaves_skipped_steps_out():
     nan, history = float("nan"), [9.0, 1.0, float("nan"), 3.0, float("inf")]
     assert fit.recent_loss(history, 4) == 2.0
     assert np.isnan(fit.recent_loss([nan, nan], 2))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
