@@ -83,12 +83,6 @@ def surface(rng: np.random.Generator, count: int) -> np.ndarray:
 CLOUDS = {"uniform": uniform, "clusters": clusters, "surface": surface}
 
 
-def same_pairs(a: Pairs, b: Pairs, points: int) -> bool:
-    """Whether both hold the same pairs, in any order, none twice."""
-    ours, theirs = (np.sort(q.astype(np.int64) * points + p) for q, p in (a, b))
-    return np.array_equal(ours, theirs) and bool((np.diff(ours) > 0).all())
-
-
 def same_but_for_rounding(
     a: Pairs, b: Pairs, points: np.ndarray, queries: np.ndarray, radius: float
 ) -> bool:

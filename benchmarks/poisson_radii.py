@@ -6,7 +6,6 @@ One set of weights, one object after the other, radii in turns. Capacities are m
 for each radius, so that no radius pays for another's.
 """
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -22,7 +21,7 @@ from benchmarks.poisson_report import PAPER, draw, write_report
 from benchmarks.timing import circumstances, measure
 from ginn_jax import architecture, lit_scenes, objects, report, scenes
 from ginn_jax.architecture import Network
-from ginn_jax.checkpoint import load_weights
+from ginn_jax.checkpoint import RECORD, damaged, load_weights, read_record
 from ginn_jax.commandline import require, start
 from ginn_jax.dataset import ShadedPoints
 from ginn_jax.disk_radius import with_disk_radius
@@ -38,7 +37,7 @@ from ginn_jax.image import (
 )
 from ginn_jax.limits import Demands, Limits, measure_limits
 from ginn_jax.mesh import Samples, find_meshes
-from ginn_jax.metrics import mse
+from ginn_jax.metrics import true_mse
 from ginn_jax.neighbors import bucket, pad_rows
 from ginn_jax.network import Variables
 from ginn_jax.receptive_field import Oriented, in_coherent_order
@@ -79,7 +78,7 @@ class Options:
     """Two radii, a small image, few rays: to try things, not for numbers."""
 
 
-QUICK = {"radii": (0.02, 0.03), "points": 4000, "resolution": 96, "rays": 32}
+QUICK = {"radii": (0.015, 0.02), "points": 4000, "resolution": 96, "rays": 32}
 QUICK |= {"repeats": 2}
 
 
@@ -108,8 +107,10 @@ def load_model(folder: Path | None) -> Model:
         state = init_state(config)
         return Model(network, state.variables, scenes.Occlusion.radius)
     config, _, variables = load_weights(folder)
-    record = json.loads((folder / "run.json").read_text())
-    return Model(config.network, variables, record["occlusion"]["radius"])
+    record = read_record(folder / RECORD, "no run: name the --out of ao_train")
+    with damaged(folder / RECORD, "name the --out of ao_train"):
+        radius = float(record["data"]["radius"])
+    return Model(config.network, variables, radius)
 
 
 def make_subject(source: objects.Source, options: Options, radius: float) -> Subject:
@@ -186,7 +187,7 @@ def evaluate(model: Model, subject: Subject, radius: float) -> tuple[dict, dict]
     noise = float(np.mean(asked.variance))
     row = {"object": subject.name, "radius": radius}
     row |= {"points": int(np.sum(encoded.points.mask)), "pixels": int(pixels[2].sum())}
-    row |= {"mse_3d": mse(as_openness(values), np.asarray(asked.target)) - noise}
+    row |= {"mse_3d": true_mse(as_openness(values), asked.target, asked.variance)}
     row |= image_errors(subject.view, image)
     row |= {"noise_floor_3d": noise, "limits": dict(limits.sizes)}
     return row, {"f_3D": encode, "f_2D": shaded}

@@ -28,10 +28,10 @@ from ginn_jax.evaluate import View
 from ginn_jax.experiment import bar
 from ginn_jax.lighting import Light, load_environment, procedural_environment
 from ginn_jax.lit_clouds import mean_light
-from ginn_jax.lit_experiment import UNSEEN_SEED
 from ginn_jax.lit_scenes import light_mesh, lit_points
 from ginn_jax.mesh import Mesh
 from ginn_jax.metrics import tone_map
+from ginn_jax.objects import UNSEEN_SEED
 from ginn_jax.scenes import Occlusion, Settings
 
 
@@ -78,14 +78,16 @@ def main(options: Options) -> dict[str, Any]:
     meshes = choose_frames(options, ground=options.effect != "sss")
     light = choose_light(options)
     key = jax.random.key(options.seed)
-    networks = load_networks(options.effect, (None,) * 3, key=key)
+    networks = load_networks(options.effect, settings, (None,) * 3, key=key)
     carried = sequences.carried_samples(meshes[0], options.points, seed=options.seed)
     frames: dict[str, list[np.ndarray]] = {}
     with bar(console) as progress:
         task = progress.add_task("frames", total=len(meshes), note="")
-        for mesh in meshes:
+        for number, mesh in enumerate(meshes):
+            # Noise of the reference is another in each frame, as `flicker` expects.
+            seed = options.seed + number
             found, networks = shade_frame(
-                options, settings, mesh, light, carried, networks
+                options, settings, mesh, light, carried, networks, seed=seed
             )
             for name, image in found.items():
                 frames.setdefault(name, []).append(image)
@@ -121,13 +123,15 @@ def shade_frame(
     light: Light,
     carried: sequences.Carried,
     networks: dict[str, Trained],
+    *,
+    seed: int,
 ) -> tuple[dict[str, np.ndarray], dict[str, Trained]]:
     """All methods' images of a frame, the reference, its variance and the mask."""
     samples, size = sequences.samples_at(mesh, carried), options.resolution
     camera = orbit_camera(width=size, height=size)
     given, stage, units = stage_of(options, settings, mesh, light, samples)
     shot = compare.take_shot(stage, camera, settings, seed=options.seed)
-    truth = trace(shot, settings, options.reference, seed=options.seed)
+    truth = trace(shot, settings, options.reference, seed=seed)
     values = {"reference": truth.mean, "variance": truth.variance}
     for picture in screen_pictures(
         compare.with_truth(shot, truth), camera, settings, units
@@ -156,9 +160,12 @@ def stage_of(
 def albedo_of(shot: Shot) -> np.ndarray:
     """What the transported light is multiplied by to be seen."""
     mask = shot.gbuffer.mask
-    if isinstance(shot, View) or shot.pixels.medium.size:
+    if isinstance(shot, View):
         return mask.astype(np.float32)
-    return evaluate_light.fill(mask, shot.pixels.albedo[shot.pixels.material])
+    albedo = shot.pixels.albedo[shot.pixels.material]
+    if shot.pixels.medium.size:
+        albedo = np.ones_like(albedo)
+    return evaluate_light.fill(mask, albedo)
 
 
 def measure(options: Options, frames: dict[str, np.ndarray]) -> dict[str, Any]:

@@ -31,7 +31,6 @@ from ginn_jax.limits import Limits
 from ginn_jax.mesh import find_meshes
 from ginn_jax.train import Training
 
-UNSEEN_SEED = 10_000_000
 VALIDATION_RAYS = 1024
 DISK_RADII = (0.01, 0.015, 0.02)
 RAY_COUNTS = (1, 4, 16, 64, 256)
@@ -87,7 +86,7 @@ def main(options: Options) -> dict[str, Any]:
 
     network = architecture.PRESETS[options.preset]
     config = training(options, network, options.points, len(clouds))
-    extra = {"occlusion": asdict(settings), "objects": [s.name for s in train_sources]}
+    extra = {"data": asdict(settings), "objects": [s.name for s in train_sources]}
     run = train(console, config, clouds, options.out, options.resume, extra)
     clock.parts |= run.seconds
 
@@ -105,7 +104,9 @@ def main(options: Options) -> dict[str, Any]:
 
 def training_sources(options: Options) -> list[objects.Source]:
     """Procedural shapes and the user's meshes."""
-    sources = objects.procedural_sources(options.shapes, options.seed * 100_000)
+    sources = objects.procedural_sources(
+        options.shapes, options.seed * objects.SEEDS_APART
+    )
     if options.meshes is not None:
         sources += objects.file_sources(find_meshes(options.meshes))
     return sources
@@ -114,7 +115,7 @@ def training_sources(options: Options) -> list[objects.Source]:
 def unseen_sources(options: Options) -> list[objects.Source]:
     """Procedural shapes of other seeds, and the user's test meshes."""
     sources = objects.procedural_sources(
-        options.test_shapes, UNSEEN_SEED + options.seed
+        options.test_shapes, objects.UNSEEN_SEED + options.seed
     )
     if options.test_meshes is not None:
         sources += objects.file_sources(find_meshes(options.test_meshes))

@@ -18,6 +18,7 @@ from rich.console import Console
 from ginn_jax import compare, evaluate_light, report
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
+from ginn_jax.errors import InputError
 from ginn_jax.experiment import bar
 from ginn_jax.lighting import (
     Light,
@@ -26,11 +27,10 @@ from ginn_jax.lighting import (
     procedural_environment,
 )
 from ginn_jax.lit_clouds import mean_light
-from ginn_jax.lit_experiment import UNSEEN_SEED
 from ginn_jax.lit_scenes import Scattering, light_mesh, lit_points, visible_samples
 from ginn_jax.mesh import add_ground, fit_unit_box, load_mesh
 from ginn_jax.metrics import tone_map
-from ginn_jax.objects import random_point_light
+from ginn_jax.objects import UNSEEN_SEED, random_point_light, tell_apart
 from ginn_jax.pretrained import load_pretrained
 from ginn_jax.reference import build_scene
 from ginn_jax.relight import Relightable, prepare_relighting, relight
@@ -73,12 +73,15 @@ def main(options: Options) -> dict[str, Any]:
     """Shade the object under every light; returns what metrics.json holds."""
     least = {"lights": 0, "point_lights": 0, "resolution": 32, "reference": 2}
     require(options, least | {"points": 1000, "seed": 0})
+    if options.lights + options.point_lights == 0:
+        raise InputError("--lights and --point-lights are both 0: give one at least")
     console = Console()
     counts = options.points, options.reference, 0.0
     settings = compare.effect_settings(options.effect, *counts)
     assert not isinstance(settings, compare.Occlusion)
+    unseen = UNSEEN_SEED + options.seed
     mesh = fit_unit_box(
-        load_mesh(options.mesh) if options.mesh else random_shape(UNSEEN_SEED)
+        load_mesh(options.mesh) if options.mesh else random_shape(unseen)
     )
     mesh = mesh if isinstance(settings, Scattering) else add_ground(mesh)
     samples = visible_samples(build_scene(mesh), options.points, options.seed)
@@ -118,16 +121,18 @@ def main(options: Options) -> dict[str, Any]:
 def choose_lights(options: Options) -> dict[str, Light]:
     """The lights by name."""
     lights: dict[str, Light] = {}
+    first = UNSEEN_SEED + options.seed
     if options.envmaps is None:
-        for seed in range(UNSEEN_SEED, UNSEEN_SEED + options.lights):
+        for seed in range(first, first + options.lights):
             lights[f"sky {seed}"] = procedural_environment(seed)
     elif options.lights:
         paths = find_environments(options.envmaps)
         step = max(len(paths) // options.lights, 1)
-        for path in paths[::step][: options.lights]:
-            lights[path.stem] = load_environment(path)
+        named = list(zip(tell_apart(paths), paths, strict=True))[::step]
+        for name, path in named[: options.lights]:
+            lights[name] = load_environment(path)
     for seed in range(options.point_lights):
-        lights[f"point light {seed}"] = random_point_light(UNSEEN_SEED + seed)
+        lights[f"point light {seed}"] = random_point_light(first + seed)
     return lights
 
 

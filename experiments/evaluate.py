@@ -35,10 +35,10 @@ from ginn_jax.disk_radius import limits_at, with_disk_radius
 from ginn_jax.evaluate import Row
 from ginn_jax.experiment import make
 from ginn_jax.lighting import find_environments
-from ginn_jax.lit_experiment import UNSEEN_SEED
 from ginn_jax.lit_scenes import light_up
 from ginn_jax.mesh import find_meshes
 from ginn_jax.objects import (
+    UNSEEN_SEED,
     Source,
     file_lights,
     file_sources,
@@ -109,7 +109,7 @@ def main(options: Options) -> dict[str, Any]:
     sources = choose_sources(options)
     runs = options.checkpoint, options.only_2d, options.only_3d
     key = jax.random.key(options.seed)
-    networks = load_networks(options.effect, runs, key=key)
+    networks = load_networks(options.effect, settings, runs, key=key)
     if not isinstance(settings, Occlusion):
         settings = replace(settings, targets=count_asked(options.points))
     clouds = make(console, "clouds", sources, settings, options.out / "clouds")

@@ -1,6 +1,7 @@
 """Put the weights of a finished run into the package.
 
-    python -m experiments.export --run runs/gi_train --name gi
+    python -m experiments.export --run runs/gi_train --name gi \\
+        --command "python -m experiments.gi_train"
 
 writes NAME.npz and the record of the run, with the network's error on one fixed scene,
 by which a test tells that the weights are the ones measured.

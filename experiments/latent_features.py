@@ -17,13 +17,14 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from scipy.spatial import KDTree
 
-from ginn_jax import compare, evaluate_light, image
+from ginn_jax import compare, image
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
 from ginn_jax.lighting import procedural_environment
-from ginn_jax.lit_experiment import UNSEEN_SEED
+from ginn_jax.lit_clouds import network_numbers
 from ginn_jax.lit_scenes import light_mesh, lit_points, visible_samples
 from ginn_jax.mesh import Mesh, add_ground, fit_unit_box, load_mesh
+from ginn_jax.objects import UNSEEN_SEED
 from ginn_jax.pretrained import load_pretrained
 from ginn_jax.reference import GBuffer, build_scene, render_gbuffer
 from ginn_jax.scenes import Occlusion
@@ -60,8 +61,9 @@ QUICK = {"resolution": 48, "points": 3000, "channels": 2}
 def main(options: Options) -> Path:
     """Draw the figure; returns its path."""
     require(options, {"channels": 1, "resolution": 32, "points": 1000, "seed": 0})
+    unseen = UNSEEN_SEED + options.seed
     mesh = fit_unit_box(
-        load_mesh(options.mesh) if options.mesh else random_shape(UNSEEN_SEED)
+        load_mesh(options.mesh) if options.mesh else random_shape(unseen)
     )
     mesh = mesh if options.effect == "sss" else add_ground(mesh)
     position, code = latent_code(options, mesh)
@@ -91,10 +93,10 @@ def latent_code(
     settings = compare.effect_settings(options.effect, options.points, 2, 0.1)
     numbers: tuple[Any, ...] = ()
     if not isinstance(settings, Occlusion):
-        light = procedural_environment(UNSEEN_SEED)
+        light = procedural_environment(UNSEEN_SEED + options.seed)
         lit = light_mesh(mesh, light, settings, seed=options.seed)
         cloud = lit_points(lit, samples, settings.looks, seed=options.seed)
-        numbers = evaluate_light.network_numbers(cloud)
+        numbers = network_numbers(cloud)
     ends = weights, samples.position, samples.normal
     key = jax.random.key(options.seed)
     encoded, _ = image.encode_cloud(config.network, limits, *ends, *numbers, key=key)

@@ -151,7 +151,8 @@ def load_run(
     with damaged(path, "delete it and start anew"):
         training = dict(record["training"])
         limits = limits_from(record)
-        seconds = {name: float(record["seconds"][name]) for name in UNSPENT}
+        spent = record.get("seconds", UNSPENT)
+        seconds = {name: float(spent[name]) for name in UNSPENT}
     wanted = json.loads(json.dumps({"training": asdict(config), **extra}))
     for name in sorted(wanted["training"]):
         if training.get(name) != wanted["training"][name]:

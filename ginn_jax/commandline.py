@@ -68,9 +68,9 @@ def explain(error: Exception) -> tuple[int, str]:
     if isinstance(error, OSError) and error.errno is not None:
         place = f"{error.filename}: " if error.filename else ""
         return 2, f"{place}{error.strerror}; make room or name another place"
-    if isinstance(error, MemoryError | BrokenExecutor):
-        return 2, f"not enough memory ({error}); ask for fewer points or pixels"
     said = " ".join(str(error).split())[:300]
+    if isinstance(error, MemoryError | BrokenExecutor) or "RESOURCE_EXHAUSTED" in said:
+        return 2, f"not enough memory ({said}); ask for fewer points or pixels"
     frame = traceback.extract_tb(error.__traceback__)[-1]
     where = f"{os.path.basename(frame.filename)}:{frame.lineno}"
     return 1, (

@@ -17,6 +17,7 @@ from ginn_jax.evaluate_light import LitView
 from ginn_jax.irradiance import ColorEstimate
 from ginn_jax.lit_scenes import Illumination, Lit, Scattering
 from ginn_jax.mesh import Mesh
+from ginn_jax.metrics import relative_error
 from ginn_jax.reference import Estimate
 from ginn_jax.scenes import Occlusion, Settings
 
@@ -74,16 +75,18 @@ def errors(shot: Shot, values: Values, units: Float[np.ndarray, "C"] | None) -> 
     else:
         assert units is not None
         row = evaluate_light.lit_image_errors(shot, values, units)
-    return row | relative_error(shot, row)
+    return row | of_variance(shot, row)
 
 
-def relative_error(shot: Shot, row: Row) -> Row:
+def of_variance(shot: Shot, row: Row) -> Row:
     """The error of a row over the variance of the reference, and that variance."""
-    variance = row.get("variance_2d")
     if isinstance(shot, View):
         noise = float(np.mean(shot.variance))
         variance = float(np.var(target_of(shot))) - noise
-    return {"variance_2d": variance, "relative_mse_2d": row["mse_2d"] / variance}
+    else:
+        variance = row["variance_2d"]
+    relative = relative_error(row["mse_2d"], variance)
+    return {"variance_2d": variance, "relative_mse_2d": relative}
 
 
 def scratch_mib(compiled: Any) -> float:

@@ -11,9 +11,10 @@ from jaxtyping import Array, Key
 
 from ginn_jax import evaluate, evaluate_light
 from ginn_jax.architecture import Network
-from ginn_jax.checkpoint import load_weights
-from ginn_jax.compare import Picture, Shot, Values, relative_error, scratch_mib
+from ginn_jax.checkpoint import RECORD, damaged, load_weights, read_record
+from ginn_jax.compare import Picture, Shot, Values, of_variance, scratch_mib
 from ginn_jax.dataset import ShadedPoints, count_given
+from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model, Row, View
 from ginn_jax.evaluate_light import LitView
 from ginn_jax.image import (
@@ -31,7 +32,7 @@ from ginn_jax.limits import Limits
 from ginn_jax.lit_clouds import LitCloud, mean_light, network_numbers, split_points
 from ginn_jax.neighbors import bucket
 from ginn_jax.objects import Source
-from ginn_jax.pretrained import load_pretrained
+from ginn_jax.pretrained import load_manifest, load_pretrained
 from ginn_jax.receptive_field import Oriented
 from ginn_jax.scenes import Occlusion, Settings
 
@@ -42,17 +43,45 @@ NETWORKS = {OURS: "", "2D only": "_only_2d", "3D only": "_only_3d"}
 
 
 def load_networks(
-    effect: str, runs: Sequence[Path | None], *, key: Key[Array, ""]
+    effect: str,
+    settings: Settings,
+    runs: Sequence[Path | None],
+    *,
+    key: Key[Array, ""],
 ) -> dict[str, Trained]:
     """Our network of an effect and its ablations, of finished runs or, for None, those
-    that come with the package."""
+    that come with the package.
+
+    Raises:
+        InputError: a network of another occlusion radius than that of `settings`.
+    """
     networks = {}
     for (name, ending), run in zip(NETWORKS.items(), runs, strict=True):
         config, limits, weights = (
             load_pretrained(effect + ending) if run is None else load_weights(run)
         )
+        if isinstance(settings, Occlusion):
+            check_radius(name, learned_from(effect + ending, run), settings.radius)
         networks[name] = config.network, limits, Model(weights, key)
     return networks
+
+
+def learned_from(name: str, run: Path | None) -> dict[str, Any]:
+    """What made the targets that a network learned from."""
+    if run is None:
+        return load_manifest()[name]["data"]
+    path = run / RECORD
+    with damaged(path, "train again"):
+        return dict(read_record(path, "no run: name the --out of one")["data"])
+
+
+def check_radius(name: str, data: dict[str, Any], radius: float) -> None:
+    """Raise `InputError` unless a network learned occlusion within this radius."""
+    if data.get("radius") != radius:
+        raise InputError(
+            f"{name} learned occlusion within {data.get('radius')}, not within "
+            f"{radius}: give that as --radius, or train another"
+        )
 
 
 def points_given(cloud: Any) -> tuple[Any, np.ndarray | None]:
@@ -98,7 +127,7 @@ def network_picture(
         values = image[shot.gbuffer.mask]
     else:
         row, values, _, limits = evaluate_light.lit_network_row(*given)  # type: ignore[arg-type]
-    row |= {"method": name} | relative_error(shot, row)
+    row |= {"method": name} | of_variance(shot, row)
     return Picture(row, values), (network, limits, model)
 
 
@@ -119,7 +148,7 @@ def network_values(
     else:
         assert isinstance(shot, LitView)
         encoded, limits = evaluate_light.encode_lit(network, limits, model, cloud)
-        numbers = network_numbers(shot.pixels)
+        numbers = network_numbers(shot.pixels, evaluate_light.channels_of(encoded))
         values, limits = shade_points(
             network, limits, model.variables, encoded, *pixels, *numbers
         )

@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 from ginn_jax import report
 from ginn_jax.compare_networks import OURS
 from ginn_jax.evaluate import Row
-from ginn_jax.metrics import tone_map
+from ginn_jax.metrics import relative_error, tone_map
 
 RIVALS = ("screen space", "2D only", "3D only")
 CELLS = ("mse_3d", "mse_2d", "dssim_2d")
@@ -54,7 +54,7 @@ def pool_shots(rows: Sequence[Row]) -> list[Row]:
     for method, group in methods.items():
         numbers = [k for k, v in group[0].items() if isinstance(v, int | float)]
         mean = {k: float(np.mean([row[k] for row in group])) for k in numbers}
-        mean["relative_mse_2d"] = mean["mse_2d"] / mean["variance_2d"]
+        mean["relative_mse_2d"] = relative_error(mean["mse_2d"], mean["variance_2d"])
         pooled.append({"method": method, "shots": len(group)} | mean)
     return pooled
 

@@ -14,7 +14,15 @@ from ginn_jax.dataset import ShadedPoints, count_given
 from ginn_jax.image import as_openness, encode_cloud, shade_image, shade_points
 from ginn_jax.limits import Limits
 from ginn_jax.mesh import Mesh
-from ginn_jax.metrics import dssim, equal_rays, mse, tone_map
+from ginn_jax.metrics import (
+    dssim,
+    equal_rays,
+    median_known,
+    mse,
+    relative_error,
+    tone_map,
+    true_mse,
+)
 from ginn_jax.network import Variables
 from ginn_jax.reference import (
     Estimate,
@@ -74,6 +82,7 @@ def evaluate_clouds(
         )
         noise = float(np.mean(asked.variance))
         raw = mse(as_openness(values), asked.target)
+        spread = float(np.var(asked.target)) - noise
         rows.append(
             {
                 "name": name,
@@ -81,11 +90,11 @@ def evaluate_clouds(
                 "raw_mse_3d": raw,
                 "noise_floor_3d": noise,
                 "mse_3d": raw - noise,
-                "variance_3d": float(np.var(asked.target)) - noise,
+                "variance_3d": spread,
+                "relative_mse_3d": relative_error(raw - noise, spread),
                 "ray_variance": noise * rays,
             }
         )
-        rows[-1]["relative_mse_3d"] = rows[-1]["mse_3d"] / rows[-1]["variance_3d"]
     return rows, limits
 
 
@@ -102,10 +111,8 @@ def pool_rows(rows: Sequence[Row]) -> Row:
     pooled = {name: float(np.mean([row[name] for row in rows])) for name in names}
     return pooled | {
         "clouds": len(rows),
-        "relative_mse_3d": pooled["mse_3d"] / pooled["variance_3d"],
-        "median_relative_mse_3d": float(
-            np.median([r["relative_mse_3d"] for r in rows])
-        ),
+        "relative_mse_3d": relative_error(pooled["mse_3d"], pooled["variance_3d"]),
+        "median_relative_mse_3d": median_known([r["relative_mse_3d"] for r in rows]),
         "equal_rays": equal_rays(pooled["mse_3d"], pooled["ray_variance"]),
     }
 
@@ -153,7 +160,7 @@ def image_errors(view: View, image: Float[np.ndarray, "H W"]) -> Row:
     mask, reference = view.gbuffer.mask, view.reference
     mine, right = (tone_map(i, reference, mask) for i in (image, reference))
     return {
-        "mse_2d": mse(image, reference, mask) - float(np.mean(view.variance)),
+        "mse_2d": true_mse(image[mask], reference[mask], view.variance),
         "dssim_2d": dssim(mine, right, mask),
     }
 

@@ -28,7 +28,13 @@ from ginn_jax.lit_scenes import (
     transport,
 )
 from ginn_jax.mesh import Samples
-from ginn_jax.metrics import dssim, equal_rays, tone_map
+from ginn_jax.metrics import (
+    dssim,
+    equal_rays,
+    median_known,
+    relative_error,
+    tone_map,
+)
 from ginn_jax.objects import Source
 from ginn_jax.reference import GBuffer, build_scene, render_gbuffer
 
@@ -58,6 +64,11 @@ def distinct_channels(
     return (material[:1], light[:1]) if same else (material, light)
 
 
+def channels_of(encoded: Encoded) -> slice:
+    """The channels that were encoded, all three or the first, for the queries."""
+    return slice(np.size(np.asarray(encoded.scale)))
+
+
 def evaluate_lit_clouds(
     network: Network,
     limits: Limits,
@@ -75,7 +86,7 @@ def evaluate_lit_clouds(
     for name, cloud in zip(names, clouds, strict=True):
         given, asked = split_points(cloud, len(cloud.position) - targets)
         encoded, limits = encode_lit(network, limits, model, given)
-        numbers = network_numbers(asked)
+        numbers = network_numbers(asked, channels_of(encoded))
         ends = model.variables, encoded, asked.position, asked.normal
         values, limits = shade_points(network, limits, *ends, *numbers)
         errors = unit_errors(encoded, asked, np.maximum(values, 0.0))
@@ -100,18 +111,18 @@ def unit_errors(
         "noise_floor_3d": float(np.mean(noise[lit])),
         "variance_3d": float(np.mean(spread[lit])),
     }
-    return errors | {"relative_mse_3d": errors["mse_3d"] / errors["variance_3d"]}
+    relative = relative_error(errors["mse_3d"], errors["variance_3d"])
+    return errors | {"relative_mse_3d": relative}
 
 
 def pool_lit_rows(rows: Sequence[Row]) -> Row:
     """Means over the clouds; relative errors are ratios of means."""
     names = ("mse_3d", "noise_floor_3d", "variance_3d", "path_variance")
     pooled = {name: float(np.mean([row[name] for row in rows])) for name in names}
-    relative = [row["relative_mse_3d"] for row in rows]
     return pooled | {
         "clouds": len(rows),
-        "relative_mse_3d": pooled["mse_3d"] / pooled["variance_3d"],
-        "median_relative_mse_3d": float(np.median(relative)),
+        "relative_mse_3d": relative_error(pooled["mse_3d"], pooled["variance_3d"]),
+        "median_relative_mse_3d": median_known([r["relative_mse_3d"] for r in rows]),
         "equal_rays": equal_rays(pooled["mse_3d"], pooled["path_variance"]),
     }
 
@@ -205,11 +216,8 @@ def lit_network_row(
         lambda: encode_lit(network, limits, model, cloud)
     )
     mask = view.gbuffer.mask
-    numbers = network_numbers(view.pixels)
-    channels = encoded.scale.shape[0] if encoded.scale is not None else 1
-    material, light = (
-        np.stack([fill(mask, a) for a in number[:channels]]) for number in numbers
-    )
+    numbers = network_numbers(view.pixels, channels_of(encoded))
+    material, light = (np.stack([fill(mask, a) for a in number]) for number in numbers)
 
     def shade() -> tuple[Float[np.ndarray, "H W C"], Limits]:
         gbuffer = view.gbuffer.position, view.gbuffer.normal, mask

@@ -21,7 +21,7 @@ from ginn_jax.commandline import require, require_positive
 from ginn_jax.dataset import count_asked, count_given
 from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import Cloud
-from ginn_jax.objects import Source
+from ginn_jax.objects import SEEDS_APART, UNSEEN_SEED, Source
 from ginn_jax.process import available_cores
 from ginn_jax.train import Training
 
@@ -71,6 +71,11 @@ def check_run(options: RunOptions, least: dict[str, int]) -> None:
             f"--resolution-scale is {options.resolution_scale}: give it in (0, 1]"
         )
     require_positive(options, "learning_rate")
+    if max(options.shapes, 30) + options.seed * SEEDS_APART > UNSEEN_SEED:
+        raise InputError(
+            f"--seed {options.seed} with {options.shapes} shapes would train on those "
+            f"held back: give a seed below {UNSEEN_SEED // SEEDS_APART}"
+        )
 
 
 @dataclass
@@ -120,8 +125,13 @@ def train(
     resume: bool,
     extra: dict[str, Any],
 ) -> fit.Fit:
-    """`fit.fit` with a progress bar, or a line every 100 steps where none can be."""
+    """`fit.fit` with a progress bar, or a line every 100 steps where none can be.
+
+    What was reported of an earlier run in `out` is removed: it is of other weights.
+    """
     begin = time.perf_counter()
+    for name in report.RESULTS:
+        (out / name).unlink(missing_ok=True)
     with bar(console) as progress:
         task = progress.add_task("training", total=config.steps, note="compiling")
 

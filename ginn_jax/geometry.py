@@ -42,40 +42,40 @@ class Geometry(NamedTuple):
     grid: VoxelGrid
 
 
-def limit_names(config: Network) -> tuple[str, ...]:
+def limit_names(network: Network) -> tuple[str, ...]:
     """The name of every capacity of a network."""
     names = [
         f"level_{i}.{part}"
-        for i in range(len(config.levels))
+        for i in range(len(network.levels))
         for part in (*Demand._fields, "points")
     ]
-    if needs_areas(config):
-        names += [f"{area_search(config).name}.{part}" for part in Demand._fields]
-    for conv in (*config.encoder, config.query):
-        if conv is not config.query and transposed(config, conv):
+    if needs_areas(network):
+        names += [f"{area_search(network).name}.{part}" for part in Demand._fields]
+    for conv in (*network.encoder, network.query):
+        if conv is not network.query and transposed(network, conv):
             continue
         names += [f"{conv.name}.{part}" for part in Demand._fields]
-        names += [f"{conv.name}.pairs"] if config.density == "kde" else []
+        names += [f"{conv.name}.pairs"] if network.density == "kde" else []
     return tuple(names)
 
 
-def needs_areas(config: Network) -> bool:
+def needs_areas(network: Network) -> bool:
     """Whether no convolution's edges tell the area that finest points stand for."""
-    within = any(c.source == c.target == 0 for c in config.encoder)
-    return config.density == "surface" and not within
+    within = any(c.source == c.target == 0 for c in network.encoder)
+    return network.density == "surface" and not within
 
 
-def area_search(config: Network) -> Conv:
+def area_search(network: Network) -> Conv:
     """The search that tells it then, as wide as a convolution's would be."""
-    return Conv("area", 0, 0, 2.5 * config.levels[0], 0.25, 1)
+    return Conv("area", 0, 0, 2.5 * network.levels[0], 0.25, 1)
 
 
-def uniform_limits(config: Network, size: int) -> Limits:
+def uniform_limits(network: Network, size: int) -> Limits:
     """The same capacity for everything (a word is worth many): to start measuring."""
     return Limits(
         tuple(
             (name, max(size // 64, 64) if name.endswith(".words") else size)
-            for name in limit_names(config)
+            for name in limit_names(network)
         )
     )
 
@@ -103,7 +103,7 @@ def turn_edges(edges: Edges, senders: int, receivers: int) -> Edges:
 
 
 def receptive_field(
-    config: Network,
+    network: Network,
     conv: Conv,
     limits: Limits,
     senders: Oriented,
@@ -113,7 +113,7 @@ def receptive_field(
 ) -> tuple[Field, Demands]:
     """Kernel inputs and weights of every edge; `area` is of the senders."""
     radius = jnp.float32(conv.radius)
-    inputs = kernel_inputs(senders, receivers, edges, radius, config.oriented)
+    inputs = kernel_inputs(senders, receivers, edges, radius, network.oriented)
     demands: Demands = {}
     if area is None:
         name = f"{conv.name}.pairs"
@@ -132,7 +132,7 @@ def receptive_field(
 
 
 def build_geometry(
-    config: Network,
+    network: Network,
     limits: Limits,
     cloud: Oriented,
     names: Int[Array, "N"] | None = None,
@@ -146,55 +146,57 @@ def build_geometry(
     """
     if names is None:
         names = jnp.arange(cloud.mask.shape[0], dtype=jnp.int32)
-    levels, grids, rows, demands = _build_levels(config, limits, cloud, names, key)
+    levels, grids, rows, demands = _build_levels(network, limits, cloud, names, key)
     finest = levels[0]
     found: dict[str, Edges] = {}
-    for conv in reversed(config.encoder):
+    for conv in reversed(network.encoder):
         receivers = levels[conv.target]
-        twin = transposed(config, conv)
+        twin = transposed(network, conv)
         if twin in found:
             count = levels[conv.source].mask.shape[0]
             found[conv.name] = turn_edges(found[twin], receivers.mask.shape[0], count)
             continue
-        grid = grid_of(config, grids, conv.source, levels[conv.source])
+        grid = grid_of(network, grids, conv.source, levels[conv.source])
         found[conv.name], more = search(conv, limits, grid, receivers)
         demands |= more
-    areas = _level_areas(config, levels, found)
-    if needs_areas(config):
-        conv = area_search(config)
-        edges, more = search(conv, limits, grid_of(config, grids, 0, finest), finest)
-        areas[0] = _areas(config, finest, edges, conv.radius)
+    areas = _level_areas(network, levels, found)
+    if needs_areas(network):
+        conv = area_search(network)
+        edges, more = search(conv, limits, grid_of(network, grids, 0, finest), finest)
+        areas[0] = _areas(network, finest, edges, conv.radius)
         demands |= more
     fields = {}
-    for conv in config.encoder:
+    for conv in network.encoder:
         ends = levels[conv.source], levels[conv.target]
         fields[conv.name], more = receptive_field(
-            config, conv, limits, *ends, found[conv.name], areas.get(conv.source)
+            network, conv, limits, *ends, found[conv.name], areas.get(conv.source)
         )
         demands |= more
-    grid = grid_of(config, grids, 0, finest)
+    grid = grid_of(network, grids, 0, finest)
     return Geometry(levels, rows, fields, areas.get(0), grid), demands
 
 
 def grid_of(
-    config: Network, grids: dict[int, VoxelGrid], level: int, points: Oriented
+    network: Network, grids: dict[int, VoxelGrid], level: int, points: Oriented
 ) -> VoxelGrid:
     """The grid of a level (-1: the cloud), built when first asked for."""
     if level not in grids:
-        radii = [c.radius for c in (*config.encoder, config.query) if c.source == level]
-        cell = min(radii, default=2 * config.levels[0])
+        radii = [
+            c.radius for c in (*network.encoder, network.query) if c.source == level
+        ]
+        cell = min(radii, default=2 * network.levels[0])
         grids[level] = build_grid(points.position, points.mask, jnp.float32(cell))
     return grids[level]
 
 
-def transposed(config: Network, conv: Conv) -> str | None:
+def transposed(network: Network, conv: Conv) -> str | None:
     """The later convolution over the same pairs in the other direction, if any.
 
     The paper's density needs edges sorted by receiver, so there each is searched.
     """
-    if config.density == "kde":
+    if network.density == "kde":
         return None
-    for other in config.encoder[config.encoder.index(conv) + 1 :]:
+    for other in network.encoder[network.encoder.index(conv) + 1 :]:
         ends = (other.target, other.source, other.radius)
         if (
             ends == (conv.source, conv.target, conv.radius)
@@ -205,7 +207,7 @@ def transposed(config: Network, conv: Conv) -> str | None:
 
 
 def _build_levels(
-    config: Network,
+    network: Network,
     limits: Limits,
     cloud: Oriented,
     names: Int[Array, "N"],
@@ -221,17 +223,17 @@ def _build_levels(
     levels: list[Level] = []
     demands: Demands = {}
     points = cloud
-    for i, radius in enumerate(config.levels):
+    for i, radius in enumerate(network.levels):
         parts = [f"level_{i}.{part}" for part in (*Demand._fields, "points")]
         *searched, kept = (limits.of(part) for part in parts)
         lots = draw_lots(cloud.mask.shape[0], key=jax.random.fold_in(key, i))
         level, demand = build_level(
-            grid_of(config, grids, i - 1, points),
+            grid_of(network, grids, i - 1, points),
             *points,
             jnp.float32(radius),
             LevelLimit(EdgeLimit(*searched), kept),
             lots[names],
-            config.sided,
+            network.sided,
         )
         names = names[level.index]
         demands |= dict(zip(parts, (*demand.search, demand.points), strict=True))
@@ -242,26 +244,27 @@ def _build_levels(
 
 
 def _level_areas(
-    config: Network, levels: Sequence[Oriented], found: dict[str, Edges]
+    network: Network, levels: Sequence[Oriented], found: dict[str, Edges]
 ) -> dict[int, Array]:
     """Point areas of each level, from the convolution within it."""
-    if config.density == "kde":
+    if network.density == "kde":
         return {}
-    within = {c.source: c for c in config.encoder if c.source == c.target}
+    within = {c.source: c for c in network.encoder if c.source == c.target}
     return {
-        i: _areas(config, levels[i], found[c.name], c.radius) for i, c in within.items()
+        i: _areas(network, levels[i], found[c.name], c.radius)
+        for i, c in within.items()
     }
 
 
-def _areas(config: Network, points: Oriented, edges: Edges, radius: float) -> Array:
+def _areas(network: Network, points: Oriented, edges: Edges, radius: float) -> Array:
     """The area that each point stands for, of its own side if the network tells."""
-    counted = same_side(points.normal, edges) if config.sided else None
+    counted = same_side(points.normal, edges) if network.sided else None
     ends = points.position, points.mask, edges
     return point_area(*ends, jnp.float32(radius), counted)
 
 
 def build_query_field(
-    config: Network,
+    network: Network,
     limits: Limits,
     finest: Oriented,
     grid: VoxelGrid,
@@ -269,8 +272,8 @@ def build_query_field(
     queries: Oriented,
 ) -> tuple[Field, Demands]:
     """The field of f_2D: from the finest level, its grid and areas, to the queries."""
-    edges, demands = search(config.query, limits, grid, queries)
+    edges, demands = search(network.query, limits, grid, queries)
     field, more = receptive_field(
-        config, config.query, limits, finest, queries, edges, area
+        network, network.query, limits, finest, queries, edges, area
     )
     return field, demands | more

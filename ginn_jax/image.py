@@ -17,13 +17,7 @@ from ginn_jax.architecture import Network
 from ginn_jax.checks import LARGEST, number, real_array, unit_rows
 from ginn_jax.dataset import center_of, relative_to
 from ginn_jax.errors import InputError
-from ginn_jax.limits import (
-    Limits,
-    exceeded,
-    most_exceeded,
-    raise_limits,
-    say_raised,
-)
+from ginn_jax.limits import Demands, Limits, say_raised, with_room
 from ginn_jax.neighbors import bucket, pad_rows
 from ginn_jax.network import Variables
 from ginn_jax.process import ALONE
@@ -33,8 +27,6 @@ from ginn_jax.upsample import Surface, sample_pixels, upsample
 from ginn_jax.voxels import morton_code
 
 BLOCK = 1 << 15
-SLACK = 1.25
-
 
 encode_whole = jax.jit(encode, static_argnums=(0, 1))
 shade_block = jax.jit(
@@ -72,15 +64,15 @@ def encode_cloud(
     turned, _ = pad_rows(np.asarray(normal, np.float32), rows)
     cloud = Oriented(padded, turned, mask)
     more = pad_channels(material, rows), pad_channels(light, rows)
-    given = limits
-    while True:
+
+    def attempt(limits: Limits) -> tuple[Encoded, list[Demands]]:
         deep = without(limits, network.query.name)
-        encoded, demands = encode_whole(network, deep, variables, cloud, *more, key)
-        if not (short := exceeded(limits, demands)):
-            break
-        limits = raise_limits(limits, short, SLACK)
-    say_raised(given, limits)
-    return encoded._replace(center=center), limits
+        made, demands = encode_whole(network, deep, variables, cloud, *more, key)
+        return made, [demands]
+
+    encoded, sufficed = with_room(limits, attempt)
+    say_raised(limits, sufficed)
+    return encoded._replace(center=center), sufficed
 
 
 def check_numbers(name: str, numbers: Any, width: int, rows: int) -> None:
@@ -154,8 +146,8 @@ def shade_points(
     whole = Oriented(place, turned, mask)
     asked = numbers_asked(network, material, light)
     numbers = tuple(pad_channels(a, rows) for a in asked)
-    given = limits
-    while True:
+
+    def attempt(limits: Limits) -> tuple[list[Array], list[Demands]]:
         parts, demands = [], []
         flat = only(limits, network.query.name)
         for turn, first in enumerate(range(0, rows, size)):
@@ -168,16 +160,14 @@ def shade_points(
             )
             parts.append(values)
             demands.append(demand)
-        short = most_exceeded(limits, jax.device_get(demands))
-        if not short:
-            break
-        limits = raise_limits(limits, short, SLACK)
-    say_raised(given, limits)
-    if not parts:
-        channels = () if encoded.scale is None else encoded.scale.shape
-        return np.zeros((0, *channels), np.float32), limits
-    values = [np.moveaxis(np.asarray(part), -1, 0) for part in parts]
-    return np.concatenate(values)[: len(position)], limits
+        return parts, demands
+
+    parts, sufficed = with_room(limits, attempt)
+    say_raised(limits, sufficed)
+    channels = () if encoded.scale is None else encoded.scale.shape
+    values = [np.zeros((0, *channels), np.float32)]
+    values += [np.moveaxis(np.asarray(part), -1, 0) for part in parts]
+    return np.concatenate(values)[: len(position)], sufficed
 
 
 @lru_cache(maxsize=8)
@@ -243,7 +233,7 @@ def shade_image(
     material, light = numbers_asked(network, material, light)
     pixel, surface = coherent_pixels(position, mask), Surface(position, normal, mask)
 
-    def shade(wanted: Bool[np.ndarray, "H W"], limits: Limits) -> Limits:
+    def compute(wanted: Bool[np.ndarray, "H W"], limits: Limits) -> Limits:
         rows = pixel[wanted.reshape(-1)[pixel]]
         ends = (np.asarray(a).reshape(-1, 3)[rows] for a in (position, normal))
         more = (
@@ -256,11 +246,11 @@ def shade_image(
         return limits
 
     if resolution_scale == 1:
-        return values, shade(mask, limits)
+        return values, compute(mask, limits)
     places = tuple(sample_pixels(n, resolution_scale) for n in mask.shape)
     sampled = np.zeros_like(mask)
     sampled[np.ix_(*places)] = mask[np.ix_(*places)]
-    limits = shade(sampled, limits)
+    limits = compute(sampled, limits)
     coarse, thickness = values[np.ix_(*places)], 0.2 * network.query.radius
     between, known = map(np.asarray, _upsample(coarse, *places, surface, thickness))
     rest = mask & ~sampled
@@ -268,7 +258,7 @@ def shade_image(
     np.copyto(
         values, between, where=filled.reshape(*mask.shape, *(1 for _ in channels))
     )
-    return values, shade(rest & ~known, limits)
+    return values, compute(rest & ~known, limits)
 
 
 def within_range(

@@ -7,8 +7,9 @@ tell which limit to raise. Host-level calls raise it, try again, and say so once
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
@@ -18,6 +19,9 @@ from ginn_jax.errors import InputError
 
 LOG = logging.getLogger("ginn_jax")
 Demands = dict[str, Int[Any, ""]]
+Made = TypeVar("Made")
+# What host-level calls make room for beyond what they needed.
+SLACK = 1.25
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,17 @@ def most_exceeded(limits: Limits, demands: Sequence[Demands]) -> dict[str, int]:
         for name, need in exceeded(limits, demand).items():
             short[name] = max(need, short.get(name, 0))
     return short
+
+
+def with_room(
+    limits: Limits, attempt: Callable[[Limits], tuple[Made, Sequence[Demands]]]
+) -> tuple[Made, Limits]:
+    """Host: what `attempt` makes in limits that suffice for its demands, and those."""
+    while True:
+        made, demands = attempt(limits)
+        if not (short := most_exceeded(limits, jax.device_get(demands))):
+            return made, limits
+        limits = raise_limits(limits, short, SLACK)
 
 
 def say_raised(given: Limits, found: Limits) -> None:

@@ -28,8 +28,11 @@ from ginn_jax.lit_clouds import LitCloud, mean_light, split_points
 from ginn_jax.lit_report import write_report
 from ginn_jax.lit_scenes import Illumination, Scattering
 from ginn_jax.mesh import find_meshes
+from ginn_jax.metrics import relative_error
 from ginn_jax.objects import (
     PAPER_SPLIT,
+    SEEDS_APART,
+    UNSEEN_SEED,
     LightSource,
     Source,
     file_lights,
@@ -42,7 +45,6 @@ from ginn_jax.objects import (
 )
 from ginn_jax.train import Training
 
-UNSEEN_SEED = 10_000_000
 VALIDATION_PATHS = 512
 PATH_COUNTS = (1, 4, 16, 64)
 Preset = Literal["homogeneous", "linear", "released", "only_2d", "only_3d"]
@@ -121,9 +123,9 @@ def choose_sources(
 ) -> tuple[list[Source], dict[str, list[Source]]]:
     """Objects under lights to train on, and those, by name of the set, to test on."""
     seed, each = options.seed, options.lights
-    objects = procedural_sources(options.shapes, seed * 100_000)
+    objects = procedural_sources(options.shapes, seed * SEEDS_APART)
     objects += _files(options.meshes, find_meshes, file_sources)
-    lights = procedural_lights(max(options.shapes, 30), seed * 100_000)
+    lights = procedural_lights(max(options.shapes, 30), seed * SEEDS_APART)
     lights += _files(options.envmaps, find_environments, file_lights)
     if options.split == "paper":
         return paper_sources(options, objects, lights)
@@ -188,7 +190,8 @@ def evaluation(
         )
         pooled = evaluate_light.pool_lit_rows(rows)
         metrics |= {f"unseen {name}": pooled, f"unseen {name}, each": rows}
-    shown = [(s[i], clouds[n][i]) for n, s in unseen.items() for i in range(2)][:6]
+    firsts = (list(zip(unseen[n], clouds[n], strict=True))[:2] for n in unseen)
+    shown = [pair for pairs in firsts for pair in pairs][:6]
     images = image_evaluation(options, config, limits, model, settings, shown)
     return metrics[f"unseen {next(iter(unseen))}"] | metrics | images
 
@@ -222,7 +225,7 @@ def image_evaluation(
             rows.append(row | {"name": source.name})
     means = mean_rows(rows)
     for row in means:
-        row["relative_mse_2d"] = row["mse_2d"] / row["variance_2d"]
+        row["relative_mse_2d"] = relative_error(row["mse_2d"], row["variance_2d"])
     groups = {
         "network (f_3D + f_2D)": [r for r in means if "paths" not in r],
         "path tracing": [r for r in means if "paths" in r],

@@ -20,6 +20,7 @@ from ginn_jax.irradiance import (
     light_scene,
 )
 from ginn_jax.lighting import Light
+from ginn_jax.limits import LOG
 from ginn_jax.lit_clouds import LitCloud
 from ginn_jax.mesh import Mesh, Samples, sample_surface
 from ginn_jax.objects import Source, load_light, load_object
@@ -31,6 +32,8 @@ FAR, PROBE_RAYS = 100.0, 32
 OBJECT = 0  # the material of what stands on the ground
 # Mean free paths in the length of an object beyond which nothing is seen to change.
 DENSEST = 500.0
+# The share of lost walks from which on a mesh is said not to hold its medium.
+MOST_LOST = 0.05
 
 
 @dataclass(frozen=True)
@@ -138,7 +141,14 @@ def transport(
     extinction, ior = (float(x) for x in lit.medium)
     medium = Medium(lit.albedo[0], extinction, ior)
     ends = lit.scene, medium, position, normal
-    return subsurface_exitance(*ends, paths=paths, seed=seed)[0]
+    found, lost = subsurface_exitance(*ends, paths=paths, seed=seed)
+    if lost > MOST_LOST:
+        LOG.warning(
+            "%.0f %% of the walks in the medium left it by holes of the mesh and count "
+            "as dark: close them",
+            100 * lost,
+        )
+    return found
 
 
 def lit_cloud(source: Source, settings: Illumination | Scattering) -> LitCloud:

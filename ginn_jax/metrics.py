@@ -5,6 +5,7 @@ or points where it is True. Images are linear until `tone_map`; `dssim` takes
 tone-mapped ones.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -48,19 +49,20 @@ def true_mse(
     return mse(prediction, target, mask) - float(_kept(variance, mask).mean())
 
 
-def relative_mse(
-    prediction: Image, target: Image, variance: Image, mask: Mask | None = None
-) -> float:
-    """`true_mse` over the variance of the target, both with the noise subtracted.
+def relative_error(error: float, variance: float) -> float:
+    """An MSE over the variance of its target, both with the noise subtracted.
 
-    0 is perfect; predicting the mean of the target everywhere scores 1. To pool
-    several clouds, concatenate them. Raises `InputError` where the target is constant.
+    0 is perfect; predicting the mean of the target everywhere scores 1. To pool several
+    clouds divide the means of both. NaN where the target is constant up to noise, which
+    gives the error no scale.
     """
-    target, variance = _pair(target, variance)
-    spread = _kept(target, mask).var() - _kept(variance, mask).mean()
-    if not spread > 0:
-        raise InputError("target is constant up to noise: relative MSE has no scale")
-    return true_mse(prediction, target, variance, mask) / float(spread)
+    return error / variance if variance > 0 else float("nan")
+
+
+def median_known(values: Sequence[float]) -> float:
+    """The median of those that are not NaN; NaN where none is."""
+    known = [value for value in values if not np.isnan(value)]
+    return float(np.median(known)) if known else float("nan")
 
 
 def equal_rays(error: float, per_ray_variance: float) -> float:

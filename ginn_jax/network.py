@@ -52,10 +52,10 @@ class Code(NamedTuple):
 
 
 def enter(
-    config: Network, attributes: Array, light: Array | None
+    network: Network, attributes: Array, light: Array | None
 ) -> tuple[Array, Array | None]:
     """Attributes and light as the network takes them."""
-    if light is None or config.linear:
+    if light is None or network.linear:
         return attributes, light
     return jnp.concatenate([attributes, light], axis=1), None
 
@@ -84,7 +84,7 @@ class Gate(nn.Module):
 class McConv(nn.Module):
     """One row of the table: what comes before, and the Monte Carlo convolution."""
 
-    config: Network
+    network: Network
     conv: Conv
     train: bool
 
@@ -92,13 +92,13 @@ class McConv(nn.Module):
     def __call__(
         self, x: Code, mask: Bool[Array, "N"], field: Field, receivers: int
     ) -> Code:
-        conv, config = self.conv, self.config
+        conv, network = self.conv, self.network
         free, light = x
         if conv.before in ("norm", "dense"):
-            free = Norm(config.norm, self.train)(free, mask)
+            free = Norm(network.norm, self.train)(free, mask)
         if conv.before in ("dense", "lift"):
             free = nn.Dense(conv.channels)(free)
-            free = Norm(config.norm, self.train)(free, mask)
+            free = Norm(network.norm, self.train)(free, mask)
             if light is not None:
                 light = Gate(conv.channels)(free, light)
         both = free if light is None else jnp.concatenate([free, light], axis=1)
@@ -108,8 +108,8 @@ class McConv(nn.Module):
             lambda key: init_kernel(
                 field.inputs.shape[0],
                 kernels,
-                config.hidden,
-                config.group or kernels,
+                network.hidden,
+                network.group or kernels,
                 key=key,
             ),
         )
@@ -128,7 +128,7 @@ class McConv(nn.Module):
 class Encoder(nn.Module):
     """f_3D: the encoder-decoder, from attributes and light to a code per point."""
 
-    config: Network
+    network: Network
     train: bool
 
     @nn.compact
@@ -138,27 +138,27 @@ class Encoder(nn.Module):
         light: Float[Array, "N L"] | None,
         geometry: Geometry,
     ) -> Code:
-        config, levels = self.config, geometry.levels
+        network, levels = self.network, geometry.levels
         done: dict[str, Code] = {}
-        x = Code(*enter(config, attributes, light))
-        for conv in config.encoder:
-            layer = McConv(config, conv, self.train, name=conv.name)
+        x = Code(*enter(network, attributes, light))
+        for conv in network.encoder:
+            layer = McConv(network, conv, self.train, name=conv.name)
             field, target = geometry.fields[conv.name], levels[conv.target]
             x = layer(x, levels[conv.source].mask, field, target.mask.shape[0])
             if conv.skip is not None:
                 x = join(done[conv.skip], x)
             done[conv.name] = x
         free = x.free
-        if config.encoder:
-            free = Norm(config.norm, self.train)(free, levels[0].mask)
-        free = nn.Dense(config.latent, name="latent")(free)
-        free = Norm(config.norm, self.train)(free, levels[0].mask)
+        if network.encoder:
+            free = Norm(network.norm, self.train)(free, levels[0].mask)
+        free = nn.Dense(network.latent, name="latent")(free)
+        free = Norm(network.norm, self.train)(free, levels[0].mask)
         if x.light is not None:
             return Code(free, self._dim(free, x.light))
-        return Code(free, light if config.local and not config.splat else None)
+        return Code(free, light if network.local else None)
 
     def _dim(self, free: Array, light: Array) -> Array:
-        return Gate(self.config.latent, name="latent_light")(free, light)
+        return Gate(self.network.latent, name="latent_light")(free, light)
 
 
 def splat(values: Float[Array, "N"], field: Field, receivers: int) -> Float[Array, "M"]:
@@ -178,7 +178,7 @@ class Shader(nn.Module):
     A network that splats has its 1x1 layers at the points instead.
     """
 
-    config: Network
+    network: Network
     train: bool
 
     @nn.compact
@@ -190,23 +190,27 @@ class Shader(nn.Module):
         mask: Bool[Array, "M"],
         field: Field,
     ) -> Float[Array, "M"]:
-        config = self.config
+        network = self.network
         senders = jnp.ones(code.free.shape[0], bool)
-        if config.splat:
-            free = nn.Dense(config.head)(code.free)
-            free = Norm(config.norm, self.train)(free, senders)
-            return splat(nn.Dense(1)(free)[:, 0], field, mask.shape[0])
-        layer = McConv(config, config.query, self.train, name=config.query.name)
+        if network.splat:
+            free = nn.Dense(network.head)(code.free)
+            free = Norm(network.norm, self.train)(free, senders)
+            values = nn.Dense(1)(free)[:, 0]
+            if code.light is not None:
+                dimmed = Gate(network.head, name="out_light")(free, code.light)
+                values += jnp.sum(dimmed, axis=1)
+            return splat(values, field, mask.shape[0])
+        layer = McConv(network, network.query, self.train, name=network.query.name)
         x = layer(code, senders, field, attributes.shape[0])
-        seen, _ = enter(config, attributes, light)
-        free = Norm(config.norm, self.train)(x.free, mask)
-        free = nn.Dense(config.head)(jnp.concatenate([free, seen], axis=1))
-        free = Norm(config.norm, self.train)(free, mask)
+        seen, _ = enter(network, attributes, light)
+        free = Norm(network.norm, self.train)(x.free, mask)
+        free = nn.Dense(network.head)(jnp.concatenate([free, seen], axis=1))
+        free = Norm(network.norm, self.train)(free, mask)
         values = jnp.zeros(mask.shape)
-        if not config.linear:
+        if not network.linear:
             values = nn.Dense(1)(free)[:, 0]
         if x.light is None:
             return values
         beams = [x.light] if light is None else [x.light, light]
-        dimmed = Gate(config.head, name="out_light")(free, jnp.concatenate(beams, 1))
+        dimmed = Gate(network.head, name="out_light")(free, jnp.concatenate(beams, 1))
         return values + jnp.sum(dimmed, axis=1)

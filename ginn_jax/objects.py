@@ -23,6 +23,8 @@ from ginn_jax.mesh import Mesh, add_ground, fit_unit_box, load_mesh
 from ginn_jax.shapes import random_shape
 
 T = TypeVar("T")
+# Seeds of what is trained on lie below UNSEEN_SEED, `SEEDS_APART` for each --seed.
+SEEDS_APART, UNSEEN_SEED = 100_000, 10_000_000
 
 
 @dataclass(frozen=True)
@@ -150,9 +152,12 @@ def pair_up(
 
 
 def load_object(source: Source, ground: bool = True) -> Mesh:
-    """The object in its unit box, on the ground if there is one."""
+    """The object in its unit box, on the ground if there is one.
+
+    Without ground it is there for its medium, which only a closed shape can hold.
+    """
     if source.path is None:
-        mesh = random_shape(shape_seed(source))
+        mesh = random_shape(shape_seed(source), closed=not ground)
     else:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", InputWarning)

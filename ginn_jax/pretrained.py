@@ -118,7 +118,7 @@ def record_of(run: Path, metrics: Record, limits: Limits) -> Record:
     return {
         "training": made["training"],
         "limits": dict(limits.sizes),
-        "data": made.get("data", made.get("occlusion")),
+        "data": made["data"],
         "objects": len(made["objects"]),
         "errors": {
             key: {name: value[name] for name in names} for key, value in pooled.items()

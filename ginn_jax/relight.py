@@ -14,15 +14,8 @@ from ginn_jax.architecture import Network
 from ginn_jax.checks import unit_rows
 from ginn_jax.dataset import center_of, relative_to
 from ginn_jax.geometry import Geometry, build_geometry, build_query_field
-from ginn_jax.image import SLACK, block_size, only, pad_channels, without
-from ginn_jax.limits import (
-    Demands,
-    Limits,
-    exceeded,
-    most_exceeded,
-    raise_limits,
-    say_raised,
-)
+from ginn_jax.image import block_size, only, pad_channels, without
+from ginn_jax.limits import Demands, Limits, say_raised, with_room
 from ginn_jax.lit_clouds import LitCloud, network_numbers
 from ginn_jax.mcconv import stored_kernel
 from ginn_jax.neighbors import bucket, pad_rows
@@ -145,16 +138,18 @@ def prepare_relighting(
     """
     unit_rows(cloud.position, cloud.normal, "the cloud")
     unit_rows(queries.position, queries.normal, "queries")
-    center, given = center_of(cloud.position), limits
+    center = center_of(cloud.position)
     points = _padded(cloud, center, slice(None), bucket(len(cloud.position)))
-    while True:
-        deep = without(limits, network.query.name)
-        scene, demands = _plan_scene(network, deep, variables, points, key)
-        if not (short := exceeded(limits, demands)):
-            break
-        limits = raise_limits(limits, short, SLACK)
     size = block_size(len(queries.position), lit=True)
-    while True:
+
+    def plan_points(limits: Limits) -> tuple[ScenePlan, list[Demands]]:
+        deep = without(limits, network.query.name)
+        plan, demands = _plan_scene(network, deep, variables, points, key)
+        return plan, [demands]
+
+    scene, sufficed = with_room(limits, plan_points)
+
+    def plan_blocks(limits: Limits) -> tuple[list[QueryPlan], list[Demands]]:
         flat = only(limits, network.query.name)
         blocks, demands = [], []
         for number, first in enumerate(range(0, len(queries.position), size)):
@@ -164,11 +159,11 @@ def prepare_relighting(
             device = jax.devices()[number % len(jax.devices())]
             blocks.append(jax.device_put(plan, device))
             demands.append(demand)
-        if not (short := most_exceeded(limits, jax.device_get(demands))):
-            break
-        limits = raise_limits(limits, short, SLACK)
-    say_raised(given, limits)
-    return Relightable(scene, tuple(blocks)), limits
+        return blocks, demands
+
+    blocks, sufficed = with_room(sufficed, plan_blocks)
+    say_raised(limits, sufficed)
+    return Relightable(scene, tuple(blocks)), sufficed
 
 
 def _padded(

@@ -14,9 +14,11 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from ginn_jax.files import writing
 from ginn_jax.metrics import tone_map
 from ginn_jax.process import available_cores
 
+RESULTS = ("metrics.json", "report.md")
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "mitsuba", "trimesh")
 matplotlib.use("Agg")
 
@@ -56,8 +58,9 @@ def write_results(folder: Path, metrics: Mapping[str, Any], report: str) -> None
     """Write metrics.json and report.md into the folder, making it if need be."""
     folder.mkdir(parents=True, exist_ok=True)
     text = json.dumps(metrics, indent=1, default=_plain)
-    (folder / "metrics.json").write_text(text + "\n")
-    (folder / "report.md").write_text(report)
+    for name, content in zip(RESULTS, (text + "\n", report), strict=True):
+        with writing(folder / name) as new:
+            new.write_text(content)
 
 
 def _plain(value: Any) -> Any:

@@ -19,7 +19,7 @@ from ginn_jax.reference import ambient_occlusion, build_scene
 # which a pool may wait forever for a process that it does not start (python/cpython
 # #115634).
 SCENES_PER_WORKER = 200
-FORMAT = 4
+FORMAT = 5
 
 
 @dataclass(frozen=True)

@@ -4,16 +4,15 @@ Samples are taken once and move with their faces, so that what changes from fram
 frame is the scene and not the sampling.
 """
 
-import zipfile
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ginn_jax.errors import InputError
-from ginn_jax.lit_scenes import reached_by_light
+from ginn_jax.lit_scenes import OBJECT, reached_by_light
 from ginn_jax.mesh import Mesh, Samples, add_ground, fit_unit_box
 from ginn_jax.reference import build_scene
 from ginn_jax.shapes import random_shape
@@ -27,10 +26,11 @@ class Animation(NamedTuple):
 
 
 class Carried(NamedTuple):
-    """Samples by their face and where they lie in it."""
+    """Samples by their face, where they lie in it, and whether on its back."""
 
     face: Int[np.ndarray, "N"]
     barycentric: Float[np.ndarray, "N 3"]
+    behind: Bool[np.ndarray, "N"]
 
 
 def load_animation(path: Path) -> Animation:
@@ -40,15 +40,19 @@ def load_animation(path: Path) -> Animation:
         InputError: no such file, another kind of file, or numbers that make no mesh.
     """
     try:
-        with np.load(path) as file:
+        with np.load(path, allow_pickle=False) as file:
             vertices, faces = file["vertices"], file["faces"]
     except FileNotFoundError:
         raise InputError(f"{path}: no such animation") from None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    except PermissionError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror})") from None
+    except Exception:  # zipfile, zlib, tokenize and NumPy each raise what they like
         raise InputError(
             f"{path}: not an .npz of vertices [T V 3] and faces [F 3]"
         ) from None
-    whole = vertices.ndim == 3 and faces.ndim == 2 and len(vertices) > 1
+    if vertices.dtype.kind not in "fiu" or faces.dtype.kind not in "iu":
+        raise InputError(f"{path}: give vertices as real, faces as whole numbers")
+    whole = vertices.ndim == 3 and faces.ndim == 2 and len(vertices) > 1 and faces.size
     if not (whole and vertices.shape[2] == 3 and faces.shape[1] == 3):
         raise InputError(f"{path}: give vertices [T V 3], two frames up, faces [F 3]")
     if not (np.isfinite(vertices).all() and faces.min() >= 0):
@@ -60,7 +64,7 @@ def load_animation(path: Path) -> Animation:
 
 def procedural_animation(seed: int, frames: int) -> Animation:
     """A procedural shape that sways: it leans over and back and turns a little."""
-    mesh = fit_unit_box(random_shape(seed))
+    mesh = fit_unit_box(random_shape(seed, closed=True))
     phase = 2 * np.pi * np.arange(frames)[:, None] / frames
     x, y, z = mesh.vertices.T.astype(np.float64)
     height = y - y.min()
@@ -96,16 +100,23 @@ def frames_of(animation: Animation, count: int, ground: bool) -> list[Mesh]:
 
 
 def carried_samples(mesh: Mesh, count: int, *, seed: int) -> Carried:
-    """Uniform samples of a frame that light can reach, to be carried to the others."""
+    """Uniform samples of a frame that light can reach, to be carried to the others.
+
+    On both sides of the object's faces and above the ground, as `visible_samples` are.
+    """
     shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    place, face = trimesh.sample.sample_surface(shape, 2 * count, seed=seed)[:2]
+    drawn = 5 * count
+    place, face = trimesh.sample.sample_surface(shape, drawn, seed=seed)[:2]
+    behind = np.random.default_rng((seed, 8)).random(drawn) < 0.5
+    kept = ~behind | (mesh.material[face] == OBJECT)
+    place, face, behind = place[kept], face[kept], behind[kept]
     corners = mesh.vertices[mesh.faces[face]]
     barycentric = trimesh.triangles.points_to_barycentric(corners, place)
-    carried = Carried(face.astype(np.int32), barycentric.astype(np.float32))
+    carried = Carried(face.astype(np.int32), barycentric.astype(np.float32), behind)
     samples = samples_at(mesh, carried)
     seen = reached_by_light(build_scene(mesh), samples, seed)[:count]
     if len(seen) < count:
-        raise InputError("more than half of the surface is sealed inside: mend it")
+        raise InputError("nearly all of the surface is sealed inside: mend the mesh")
     return Carried(*(a[seen] for a in carried))
 
 
@@ -117,6 +128,7 @@ def samples_at(mesh: Mesh, carried: Carried) -> Samples:
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     normal = normal / np.where(length > 0, length, 1.0)
+    normal = np.where(carried.behind[:, None], -normal, normal)
     material = mesh.material[carried.face].astype(np.int32)
     return Samples(position.astype(np.float32), normal.astype(np.float32), material)
 

@@ -81,17 +81,23 @@ _CLAD = ["blob", "carving", "statue", "person", "animal", "vase", "vehicle"]
 _PILED = ["blob", "carving", "shell", "vase", "tower", "cloth", "bars", "vehicle"]
 
 
-def random_shape(seed: int) -> Mesh:
-    """Shape number `seed` (>= 0): faces look outward, unit box, +y up."""
+def random_shape(seed: int, closed: bool = False) -> Mesh:
+    """Shape number `seed` (>= 0): faces look outward, unit box, +y up.
+
+    A `closed` one can hold a medium. It is the same shape wherever that is closed.
+    """
     rng = np.random.default_rng(whole("seed", seed, 0, 2**63 - 1))
-    name = draw_family(rng)
+    name = draw_family(rng, closed)
     return shape_of(name, rng)
 
 
-def draw_family(rng: np.random.Generator) -> str:
+def draw_family(rng: np.random.Generator, closed: bool = False) -> str:
     """The name of a family, each drawn as often as its weight says."""
     weight = np.array([family.weight for family in FAMILIES.values()])
-    return str(rng.choice(list(FAMILIES), p=weight / weight.sum()))
+    while True:
+        name = str(rng.choice(list(FAMILIES), p=weight / weight.sum()))
+        if not (closed and FAMILIES[name].clad):
+            return name
 
 
 def shape_of(name: str, rng: np.random.Generator) -> Mesh:

@@ -26,18 +26,21 @@ def single_scattering_albedo(
     correction is for diffuse light inside: 21 % too dark at albedo .1 and ior 1.5.
     """
 
-    def invert(share: float) -> float:
-        if share >= min(slab_albedo(1.0, ior), 1.0):
-            return 1.0
-        # In the root of absorption the albedo is nearly linear.
-        root = brentq(lambda s: slab_albedo(1 - s * s, ior) - share, 0, 1, xtol=1e-9)
-        return 1 - float(np.asarray(root)) ** 2
-
     number("index of refraction", ior, 1.0, 2.0)
     if not np.isfinite(real_array("albedo", albedo)).all():
         raise InputError(f"albedo {albedo} is not finite: give it in [0, 1]")
     clipped = np.clip(np.asarray(albedo, np.float64), 0, 1)
-    return np.array([invert(float(a)) for a in clipped])
+    return np.array([_scattering(float(share), ior) for share in clipped])
+
+
+@functools.lru_cache(maxsize=1 << 12)
+def _scattering(share: float, ior: float) -> float:
+    """One albedo inverted: 20 ms of root finding, asked for at every launch of rays."""
+    if share >= min(slab_albedo(1.0, ior), 1.0):
+        return 1.0
+    # In the root of absorption the albedo is nearly linear.
+    root = brentq(lambda s: slab_albedo(1 - s * s, ior) - share, 0, 1, xtol=1e-9)
+    return 1 - float(np.asarray(root)) ** 2
 
 
 def slab_albedo(alpha: float, ior: float) -> float:

@@ -207,6 +207,7 @@ def ends(monkeypatch, capsys, script, *words, main=None):
         (("--steps", "1.5"), "--steps"),
         (("--steps", "many"), "--steps"),
         (("--seed", "-1"), "--seed is -1"),
+        (("--seed", "100"), "--seed 100"),
         (("--learning-rate", "nan"), "--learning-rate is nan: give it above 0"),
         (("--resolution-scale", "0"), r"--resolution-scale is 0\.0: give it in"),
         (("--preset", "none"), "--preset"),

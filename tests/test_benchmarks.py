@@ -22,6 +22,7 @@ from benchmarks import (
 )
 from ginn_jax import architecture, image
 from ginn_jax.commandline import hasten
+from ginn_jax.disk_radius import with_disk_radius
 from ginn_jax.errors import InputError
 
 
@@ -65,12 +66,9 @@ def test_quick_keeps_what_the_user_gave():
     assert hasten(options, neighbors.QUICK).queries == neighbors.QUICK["queries"]
 
 
-def test_same_pairs_knows_order_from_difference():
-    some, other = np.array([0, 0, 1]), np.array([2, 1, 0])
-    assert neighbors.same_pairs((some, other), (some[::-1], other[::-1]), 3)
-    assert not neighbors.same_pairs((some, other), (some, np.array([2, 1, 1])), 3)
-    assert not neighbors.same_pairs((some[:2], other[:2]), (some, other), 3)
-    assert not neighbors.same_pairs(*[(np.array([0, 0]), np.array([1, 1]))] * 2, 3)
+def test_quick_disks_are_those_of_the_default_network():
+    for radius in poisson_radii.QUICK["radii"]:
+        with_disk_radius(architecture.DEFAULT, radius)
 
 
 def test_pairs_may_differ_at_the_radius_only():
@@ -163,7 +161,7 @@ def test_poisson_radii(tmp_path, monkeypatch, trained):
     variables = jax.tree.map(np.asarray, untrained(config).variables)
     record = (config, tiny.ONE_LEVEL_LIMITS, variables)
     monkeypatch.setattr(poisson_radii, "load_weights", lambda _: record)
-    (tmp_path / "run.json").write_text('{"occlusion": {"radius": 0.2}}')
+    (tmp_path / "run.json").write_text('{"data": {"radius": 0.2}}')
     options = poisson_radii.Options(
         tmp_path / "out",
         tmp_path if trained else None,

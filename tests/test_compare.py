@@ -81,11 +81,14 @@ def test_inset_lies_where_the_reference_varies():
 pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
 
+LEARNED = {"data": {"radius": 0.1}}
+
+
 def finished_run(folder):
     """A folder as a training run leaves it, of the tiny untrained network."""
     folder.mkdir()
     config = replace(tiny.CONFIG, network=tiny.ONE_LEVEL)
-    checkpoint.save_run(folder, config, tiny.ONE_LEVEL_LIMITS, {})
+    checkpoint.save_run(folder, config, tiny.ONE_LEVEL_LIMITS, LEARNED)
     manager = checkpoint.open_manager(folder, fresh=True)
     checkpoint.save_state(manager, tiny.fresh_state(config, tiny.ONE_LEVEL_LIMITS))
     manager.close()

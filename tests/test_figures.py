@@ -20,7 +20,8 @@ def untrained(effect):
     """What `load_pretrained` gives, of the tiny network before its first step."""
     plain = replace(tiny.ONE_LEVEL, latent=4)
     lit = replace(plain, materials=1, lights=1)
-    network = plain if effect == "ao" else lit
+    scattering = replace(lit, materials=3, asks="all", local=True)
+    network = {"ao": plain, "gi": lit, "sss": scattering}[effect]
     config = replace(tiny.CONFIG, network=network)
     variables = jax.device_get(train.init_state(config).variables)
     return config, tiny.ONE_LEVEL_LIMITS, variables
@@ -36,21 +37,30 @@ def tiny_networks(monkeypatch):
         )
 
 
-def test_animation_tells_the_flicker_of_every_method(tmp_path):
+@pytest.mark.parametrize("effect", ["ao", "gi", "sss"])
+def test_animation_tells_the_flicker_of_every_method(tmp_path, effect):
     options = animation.Options(
-        "ao", out=tmp_path, frames=3, resolution=40, reference=16, points=1500
+        effect, out=tmp_path, frames=3, resolution=40, reference=16, points=1500
     )
     metrics = animation.main(options)
     rows = {row["method"]: row for row in metrics["flicker"]}
     methods = {"screen space", "visibility bitmask", "ours", "2D only", "3D only"}
+    methods -= {"visibility bitmask"} if effect == "sss" else set()
     assert set(rows) == methods
     assert all(np.isfinite(row["flicker"]) for row in rows.values())
-    assert rows["visibility bitmask"]["mse_2d"] < rows["ours"]["mse_2d"]
+    if effect == "ao":
+        assert rows["visibility bitmask"]["mse_2d"] < rows["ours"]["mse_2d"]
     assert (tmp_path / "animation.gif").stat().st_size > 1000
     assert (tmp_path / "strip.png").stat().st_size > 1000
     text = (tmp_path / "report.md").read_text()
     assert "procedural" in text
     assert all(name in text for name in methods)
+
+
+def test_a_network_of_another_occlusion_radius_is_refused(tmp_path):
+    options = animation.Options("ao", out=tmp_path, radius=0.2)
+    with pytest.raises(InputError, match=r"learned occlusion within 0\.1, not"):
+        animation.main(options)
 
 
 def test_every_light_has_its_error_and_its_picture(tmp_path):
@@ -88,6 +98,12 @@ def test_principal_components_find_the_plane_of_a_flat_code():
     first = (flat - flat.mean(0)) @ np.linalg.svd(flat - flat.mean(0))[2][0]
     order = first.argsort()
     assert (np.diff(ranks[order, 0]) > 0).all() or (np.diff(ranks[order, 0]) < 0).all()
+
+
+def test_no_light_at_all_is_refused(tmp_path):
+    options = environment_maps.Options(out=tmp_path, lights=0, point_lights=0)
+    with pytest.raises(InputError, match="both 0"):
+        environment_maps.main(options)
 
 
 @pytest.mark.parametrize("name", ["frames", "resolution", "reference", "points"])

@@ -107,10 +107,16 @@ def test_noise_floor_is_subtracted():
     target, noise = truth + rng.normal(0, 0.3, truth.shape), np.full(truth.shape, 0.09)
     assert metrics.mse(truth + 0.1, target) == pytest.approx(0.1, rel=0.02)
     assert metrics.true_mse(truth + 0.1, target, noise) == pytest.approx(0.01, abs=2e-3)
-    relative = metrics.relative_mse(np.full(truth.shape, 0.5), target, noise)
-    assert relative == pytest.approx(1, rel=0.05)
-    with pytest.raises(InputError, match="constant"):
-        metrics.relative_mse(truth, np.ones(truth.shape), noise)
+    error = metrics.true_mse(np.full(truth.shape, 0.5), target, noise)
+    spread = float(target.var() - noise.mean())
+    assert metrics.relative_error(error, spread) == pytest.approx(1, rel=0.05)
+
+
+def test_a_constant_target_gives_an_error_no_scale():
+    for variance in (0.0, -1e-9):
+        assert np.isnan(metrics.relative_error(0.0, variance))
+    assert metrics.median_known([np.nan, 3.0, 1.0, np.nan, 2.0]) == 2.0
+    assert np.isnan(metrics.median_known([np.nan]))
 
 
 def test_equal_rays_inverts_the_error_of_ray_tracing():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -34,12 +35,26 @@ def test_samples_move_with_their_faces():
         off = samples.position - corners[:, 0]
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         across /= np.linalg.norm(across, axis=1, keepdims=True)
+        across *= np.where(carried.behind, -1, 1)[:, None]
         np.testing.assert_allclose((off * across).sum(1), 0, atol=1e-5)
         np.testing.assert_allclose(samples.normal, across, atol=1e-4)
         np.testing.assert_array_equal(samples.material, mesh.material[carried.face])
-    still = sequences.samples_at(meshes[0], carried)
-    again = sequences.samples_at(meshes[0], carried)
-    np.testing.assert_array_equal(still.position, again.position)
+
+
+def test_a_sheet_is_sampled_on_both_sides_and_what_is_inside_out_outside():
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
+    moving = np.stack([corners, corners + np.float32([0, 0, 0.1])])
+    sheet = sequences.Animation(moving, np.array([[0, 1, 2], [0, 2, 3]]))
+    [mesh, _] = sequences.frames_of(sheet, 2, ground=False)
+    samples = sequences.samples_at(mesh, sequences.carried_samples(mesh, 400, seed=0))
+    assert 0.4 < (samples.normal[:, 2] > 0).mean() < 0.6
+    ball = trimesh.creation.icosphere(2)
+    inside_out = sequences.Animation(
+        np.stack([ball.vertices] * 2).astype(np.float32), ball.faces[:, ::-1]
+    )
+    [mesh, _] = sequences.frames_of(inside_out, 2, ground=False)
+    samples = sequences.samples_at(mesh, sequences.carried_samples(mesh, 400, seed=0))
+    assert ((samples.position * samples.normal).sum(axis=1) > 0).all()
 
 
 frames = hnp.arrays(np.float32, (4, 6), elements=st.floats(0, 1, width=32))
@@ -90,12 +105,19 @@ def test_what_is_no_animation_is_refused(tmp_path):
         "nan": good | {"vertices": np.nan * DATA.vertices},
         "outside": good | {"faces": DATA.faces + 10**6},
         "negative": good | {"faces": DATA.faces - 10**6},
+        "no faces": good | {"faces": DATA.faces[:0]},
+        "halves": good | {"faces": DATA.faces + 0.5},
+        "words": good | {"vertices": DATA.vertices.astype(str)},
     }
     for arrays in broken.values():
         np.savez(path, **arrays)
         with pytest.raises(InputError, match=r"a\.npz"):
             sequences.load_animation(path)
     path.write_bytes(b"PK\x03\x04 not a zip")
+    with pytest.raises(InputError, match="not an"):
+        sequences.load_animation(path)
+    with path.open("wb") as file:
+        np.save(file, DATA.vertices)
     with pytest.raises(InputError, match="not an"):
         sequences.load_animation(path)
     with pytest.raises(InputError, match="no such"):

@@ -105,6 +105,14 @@ def test_every_family_is_drawn(monkeypatch):
     assert drawn == set(shapes.FAMILIES)
 
 
+@given(SEED)
+def test_closed_shapes_are_the_others_wherever_those_are_closed(seed):
+    open_or_not = shapes.draw_family(np.random.default_rng(seed))
+    closed = shapes.draw_family(np.random.default_rng(seed), closed=True)
+    assert not shapes.FAMILIES[closed].clad
+    assert closed == open_or_not or shapes.FAMILIES[open_or_not].clad
+
+
 @settings(max_examples=15, deadline=None)
 @given(st.floats(0.2, 0.8), st.floats(0.2, 0.8))
 def test_marching_cubes_gives_the_volume_of_the_solid(a, b):
