@@ -113,8 +113,18 @@ ROWS = [
     Row("no meshes", directory("none"), mesh.find_meshes, "no mesh in this folder"),
     Row("no folder", missing("gone"), mesh.find_meshes, "no such file or folder"),
     # Points
-    Row("no rows", holds(POINTS.format(0), "p.ply"), mesh.load_points, "export|save"),
-    Row("5 rows, 1 there", holds(ONE_POINT.format(5), "p.ply"), mesh.load_points, "cu"),
+    Row(
+        "no rows",
+        holds(POINTS.format(0), "p.ply"),
+        mesh.load_points,
+        "cannot be read .*; export it anew",
+    ),
+    Row(
+        "5 rows, 1 there",
+        holds(ONE_POINT.format(5), "p.ply"),
+        mesh.load_points,
+        "cannot be read .cut short.; export it anew",
+    ),
     Row(
         "no normals",
         holds(ONE_POINT.format(1).replace(" nx", " a"), "p.ply"),
@@ -146,7 +156,12 @@ ROWS = [
         "enormous HDR", holds(huge(RGBE.format(10**6)), "a.hdr"), MAP, "cannot be read"
     ),
     Row("HDR of -8 rows", holds(huge(RGBE.format(-8)), "a.hdr"), MAP, "cannot be read"),
-    Row("enormous PFM", holds(huge("PF\n999999 999999\n-1\n"), "a.pfm"), MAP, "cannot"),
+    Row(
+        "enormous PFM",
+        holds(huge("PF\n999999 999999\n-1\n"), "a.pfm"),
+        MAP,
+        "cannot be read",
+    ),
 ]
 
 

@@ -16,9 +16,8 @@ from ginn_jax.geometry import (
     build_geometry,
     build_query_field,
     limit_names,
-    uniform_limits,
 )
-from ginn_jax.limits import fits
+from ginn_jax.limits import Limits, fits
 from ginn_jax.receptive_field import Oriented
 
 # The paper's kernels, batch norm, density and every kind of layer, in two levels.
@@ -81,9 +80,8 @@ def queries(isolated=0):
 def limits_of(network, factor=1):
     sizes = {"columns": 8192, "candidates": 49152, "words": 2048}
     sizes |= {"edges": 12288, "pairs": 196608, "points": ROWS}
-    limits = uniform_limits(network, 0)
     names = limit_names(network)
-    return type(limits)(tuple((n, int(factor * sizes[n.split(".")[1]])) for n in names))
+    return Limits(tuple((n, int(factor * sizes[n.split(".")[1]])) for n in names))
 
 
 @cache
