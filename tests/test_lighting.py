@@ -8,7 +8,6 @@ from hypothesis.extra import numpy as hnp
 from strategies import SEEDS
 
 from ginn_jax import lighting
-from ginn_jax.errors import InputError
 from ginn_jax.lighting import (
     EnvironmentMap,
     constant_sky,
@@ -73,11 +72,6 @@ def test_turned_map_lights_what_is_turned_along(light, start, columns):
     )
     rest = turned(turned(light, share), -share)
     np.testing.assert_array_equal(rest.radiance, light.radiance)
-
-
-def test_maps_of_other_proportions_have_no_irradiance():
-    with pytest.raises(InputError, match="twice as wide"):
-        irradiance_of(EnvironmentMap(np.ones((8, 8, 3))), unit(0, 1, 0))
 
 
 def test_directions_are_unit_vectors_that_cover_the_sphere():

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from triangles import CORNERS, clear_cut, cube, heron, one_line, soup
+from triangles import CORNERS, clear_cut, cube, heron, soup
 
 from ginn_jax import mesh as gm
-from ginn_jax.errors import InputError
 
 
 @given(CORNERS, st.lists(st.integers(0, 11), max_size=5))
@@ -32,46 +31,6 @@ def test_degenerate_faces_are_dropped_and_counted(corners, repeated):
     np.testing.assert_allclose(
         np.sort(mesh.vertices[mesh.faces], axis=1), np.sort(corners, axis=1), rtol=1e-6
     )
-
-
-@pytest.mark.parametrize(
-    ("vertices", "faces", "material", "message"),
-    [
-        (np.zeros((0, 3)), np.zeros((0, 3), int), None, "mesh: empty"),
-        (np.eye(3), np.zeros((0, 3), int), None, "mesh: empty"),
-        (np.eye(2), np.array([[0, 1, 1]]), None, "mesh: wrong shape"),
-        (np.eye(3), np.array([[0, 1, 2]]) + 0.5, None, "mesh: wrong shape"),
-        (
-            np.eye(3) * [np.nan, 1, 1],
-            np.array([[0, 1, 2]]),
-            None,
-            "mesh: 3 vertices are",
-        ),
-        (
-            np.diag([1, 1, 1e300]),
-            np.array([[0, 1, 2]]),
-            None,
-            "mesh: 1 vertices are not",
-        ),
-        (
-            np.eye(3),
-            np.array([[0, 1, 3]]),
-            None,
-            r"mesh: a face index is outside 0\.\.2",
-        ),
-        (np.eye(3), np.array([[0, 1, -1]]), None, "mesh: a face index is outside"),
-        (np.eye(3), np.array([[0, 1, 1]]), None, "mesh: all faces have zero area"),
-        (
-            np.eye(3),
-            np.array([[0, 1, 2]]),
-            np.zeros(2),
-            "mesh: give one material a face",
-        ),
-    ],
-)
-def test_bad_arrays_are_refused_in_one_line(vertices, faces, material, message):
-    with pytest.raises(InputError, match=one_line(message)):
-        gm.make_mesh(vertices, faces, material)
 
 
 @given(CORNERS)

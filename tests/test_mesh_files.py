@@ -1,15 +1,14 @@
 """Meshes from files and folders."""
 
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from triangles import one_line, signed_volume
+from triangles import signed_volume
 
 from ginn_jax import mesh as gm
-from ginn_jax.errors import InputError, InputWarning
+from ginn_jax.errors import InputWarning
 
 ASSETS = Path(__file__).parents[2] / "shared" / "assets" / "meshes"
 
@@ -30,51 +29,15 @@ def test_scenes_survive_the_trip_through_a_file(tmp_path, ending):
     assert gm.find_meshes(tmp_path) == gm.find_meshes(path) == [path]
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("none.ply", None, "no such file"),
-        ("empty.obj", b"", "cannot be read"),
-        (
-            "cut.ply",
-            trimesh.creation.box().export(file_type="ply")[:300],
-            "cannot be read",
-        ),
-        ("wrong.glb", b"glTF\0\0\0\0", "cannot be read"),
-        ("note.txt", b"hello", "cannot be read"),
-    ],
-)
-def test_bad_files_are_refused_in_one_line(tmp_path, name, content, message):
-    path = tmp_path / name
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(
-        InputError, match=one_line(f"{re.escape(str(path))}: {message}")
-    ):
-        gm.load_mesh(path)
-
-
-def test_messages_of_a_file_name_it(tmp_path):
+def test_warnings_of_a_file_name_it(tmp_path):
     solid = trimesh.creation.box()
     solid.invert()
     solid.export(tmp_path / "inverted.ply")
-    with pytest.warns(
-        InputWarning, match=one_line(r".*inverted\.ply: turned 1 closed")
-    ):
+    with pytest.warns(InputWarning, match=r"^.*inverted\.ply: turned 1 closed.*\Z"):
         gm.load_mesh(tmp_path / "inverted.ply")
-    solid.vertices[0] = np.nan
-    solid.export(tmp_path / "nan.ply")
-    with pytest.raises(
-        InputError, match=one_line(r".*nan\.ply: mesh: 1 vertices are not")
-    ):
-        gm.load_mesh(tmp_path / "nan.ply")
 
 
 def test_folders_are_searched_and_sorted(tmp_path):
-    with pytest.raises(InputError, match=one_line(".*: no mesh in this folder")):
-        gm.find_meshes(tmp_path)
-    with pytest.raises(InputError, match=one_line(".*: no such file or folder")):
-        gm.find_meshes(tmp_path / "none")
     (tmp_path / "sub").mkdir()
     for name in ("b.ply", "a.OBJ", "sub/c.glb", "notes.md"):
         (tmp_path / name).touch()

@@ -12,11 +12,7 @@ import tiny
 from ginn_jax import train
 from ginn_jax.architecture import RELEASED, Conv, Network, compact_network
 from ginn_jax.example import Asked, Example
-from ginn_jax.geometry import (
-    build_geometry,
-    build_query_field,
-    limit_names,
-)
+from ginn_jax.geometry import build_geometry, build_query_field, limit_names
 from ginn_jax.limits import Limits, fits
 from ginn_jax.receptive_field import Oriented
 

@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 import trimesh
-from jaxtyping import TypeCheckError
 from media import BALL, IORS, SLAB, medium_of, scene_of, surface
 from rooms import total
 
-from ginn_jax import irradiance, subsurface
-from ginn_jax.errors import InputError
+from ginn_jax import irradiance
 from ginn_jax.irradiance import direct_irradiance
 from ginn_jax.lighting import EnvironmentMap, PointLight, constant_sky, studio
 from ginn_jax.slab import external_reflectance
@@ -208,52 +206,3 @@ def test_seed_decides_and_chunks_are_joined(monkeypatch):
     )
     assert empty.mean.shape == (0, 3)
     assert lost == 0
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"albedo": np.array([0.5, 0.5, 1.1], np.float32)}, "albedo"),
-        ({"albedo": np.array([0.5, -0.1, 0.5], np.float32)}, "albedo"),
-        ({"albedo": np.array([0.5, np.nan, 0.5], np.float32)}, "albedo"),
-        ({"extinction": -1.0}, "extinction"),
-        ({"extinction": np.inf}, "extinction"),
-        ({"extinction": np.nan}, "extinction"),
-        ({"ior": 0.9}, "refraction"),
-        ({"ior": 2.1}, "refraction"),
-        ({"ior": np.nan}, "refraction"),
-        ({"paths": 0}, "paths"),
-        ({"seed": -1}, "seed"),
-        ({"points": np.zeros((3, 2), np.float32)}, "N, 3"),
-    ],
-)
-def test_bad_input_is_refused_in_one_line(change, message):
-    points, normals = middle(0.05, 3)
-    given = {"albedo": np.full(3, 0.5, np.float32), "extinction": 1.0, "ior": 1.3}
-    given |= {"points": points, "paths": 4, "seed": 0, **change}
-    medium = Medium(given["albedo"], given["extinction"], given["ior"])
-    with pytest.raises((InputError, TypeCheckError)) as caught:
-        subsurface.subsurface_exitance(
-            scene_of(SLAB, constant_sky()),
-            medium,
-            given["points"],
-            normals,
-            paths=given["paths"],
-            seed=given["seed"],
-        )
-    if caught.type is InputError:
-        assert message in str(caught.value)
-        assert "\n" not in str(caught.value)
-
-
-def test_scene_without_an_object_is_refused():
-    scene = scene_of(SLAB, constant_sky())
-    ground = scene.mesh._replace(material=np.ones_like(scene.mesh.material))
-    with pytest.raises(InputError, match="material 0"):
-        subsurface_exitance(
-            scene._replace(mesh=ground),
-            medium_of(0.5, 1.0, 1.3),
-            *middle(0.05, 2),
-            paths=1,
-            seed=0,
-        )

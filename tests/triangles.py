@@ -38,7 +38,3 @@ def cube(size=1.0, inside_out=False):
     solid = trimesh.creation.box((size, size, size))
     faces = solid.faces[:, ::-1] if inside_out else solid.faces
     return np.asarray(solid.vertices), np.asarray(faces)
-
-
-def one_line(message):
-    return "^" + message + r"[^\n]*\Z"
