@@ -31,6 +31,8 @@ LONGEST = (
     "image",
     "network",
     "mcconv",
+    "mcconv_gradients",
+    "receptive_field",
     "hierarchy",
     "stability",
     "figures",

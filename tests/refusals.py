@@ -19,6 +19,18 @@ RAGGED = [[1.0, 2, 3], [1.0, 2]]
 SHAPE = trimesh.creation.box()
 BOX = mesh.make_mesh(SHAPE.vertices, SHAPE.faces)
 
+# What no points with normals may be.
+PLACES = [
+    (
+        {"points": POINTS[:, :2]},
+        r"points \(20, 2\) and normals .* must both be \[N, 3\]",
+    ),
+    ({"normals": UP[:5]}, r"normals \(5, 3\) must both be \[N, 3\]"),
+    ({"points": POINTS * NAN}, "points holds non-finite .*: drop"),
+    ({"normals": UP * NAN}, "normals are non-finite or not of unit length"),
+    ({"normals": UP / 2}, "normals are .* not of unit length: divide"),
+]
+
 # For each function: what it is told, by name or in order, and what it says to that.
 Table = dict[Any, list[tuple[Any, str]]]
 

@@ -28,15 +28,29 @@ POINTS = "ply\nformat ascii 1.0\nelement vertex {}\n" + "".join(
     f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz")
 )
 ONE_POINT = POINTS + "end_header\n0 0 0 0 1 0\n"
+BAD_POINTS = "end_header\n0 0 0 0 1 0\n0 0 inf 0 1 0\n0 0 0 0 nan 0\n0 0 0 0 0 0\n"
 
 
-def image(name, value):
+def image(name, value, others=1.0):
     """A map with one pixel of this value."""
 
     def make(folder):
-        pixels = np.ones((4, 8, 3), np.float32)
+        pixels = np.full((4, 8, 3), others, np.float32)
         pixels[1, 2, 0] = value
         use_mitsuba()[0].Bitmap(pixels).write(str(folder / name))
+        return folder / name
+
+    return make
+
+
+def cut(name, share):
+    """The first part of a map."""
+
+    def make(folder):
+        pixels = np.random.default_rng(0).uniform(size=(32, 64, 3))
+        use_mitsuba()[0].Bitmap(pixels.astype(np.float32)).write(str(folder / name))
+        whole = (folder / name).read_bytes()
+        (folder / name).write_bytes(whole[: int(share * len(whole))])
         return folder / name
 
     return make
@@ -56,6 +70,7 @@ ROWS = [
     Row("long name", missing("a" * 300), mesh.load_mesh, "name too long; give the"),
     Row("line break in its name", missing("a\nb"), mesh.load_mesh, "a b: no such file"),
     Row("empty PLY", holds("", "a.ply"), mesh.load_mesh, "nothing in it"),
+    Row("empty OBJ", holds("", "a.obj"), mesh.load_mesh, "nothing in it"),
     *(
         Row(f"1 GB of nothing, {name}", zeros(name), call, "nothing in it")
         for name, call in (
@@ -91,6 +106,12 @@ ROWS = [
             ("npz", "'npz' not supported"),
         )
     ),
+    Row(
+        "GLB of version 0",
+        holds(b"glTF\0\0\0\0", "a.glb"),
+        mesh.load_mesh,
+        "cannot be read .only GLTF 2 is supported",
+    ),
     Row("PLY as OBJ", holds(PLY, "a.obj"), mesh.load_mesh, "no triangles in it"),
     Row("OBJ as PLY", holds(TRIANGLE, "a.ply"), mesh.load_mesh, "Not a ply"),
     Row(
@@ -113,8 +134,18 @@ ROWS = [
     Row("no meshes", directory("none"), mesh.find_meshes, "no mesh in this folder"),
     Row("no folder", missing("gone"), mesh.find_meshes, "no such file or folder"),
     # Points
-    Row("no rows", holds(POINTS.format(0), "p.ply"), mesh.load_points, "export|save"),
-    Row("5 rows, 1 there", holds(ONE_POINT.format(5), "p.ply"), mesh.load_points, "cu"),
+    Row(
+        "no rows",
+        holds(POINTS.format(0), "p.ply"),
+        mesh.load_points,
+        "cannot be read .*; export it anew",
+    ),
+    Row(
+        "5 rows, 1 there",
+        holds(ONE_POINT.format(5), "p.ply"),
+        mesh.load_points,
+        "cannot be read .cut short.; export it anew",
+    ),
     Row(
         "no normals",
         holds(ONE_POINT.format(1).replace(" nx", " a"), "p.ply"),
@@ -127,9 +158,33 @@ ROWS = [
         mesh.load_points,
         "zero normal; drop them",
     ),
+    Row(
+        "3 of 4 not finite or zero",
+        holds(POINTS.format(4) + BAD_POINTS, "p.ply"),
+        mesh.load_points,
+        "3 points have a non-finite value or a zero normal; drop them",
+    ),
     Row("a mesh", holds(PLY, "p.ply"), mesh.load_points, "a mesh, .* use load_mesh"),
+    Row(
+        "points as a mesh",
+        holds(ONE_POINT.format(1), "p.ply"),
+        mesh.load_mesh,
+        "a point cloud, no triangles; use load_points",
+    ),
     # Environment maps
     Row("no HDR", missing("a.hdr"), MAP, "no such file; give an environment map"),
+    Row(
+        "a folder for a map",
+        directory("a.hdr"),
+        MAP,
+        "no such file; give an environment map",
+    ),
+    Row(
+        "no maps, no folder",
+        missing("gone"),
+        lighting.find_environments,
+        "no such file or folder; give environment maps",
+    ),
     Row("no maps", directory("none"), lighting.find_environments, "no .hdr, .exr"),
     *(
         Row(f"{name} of {value}", image(name, value), MAP, said)
@@ -137,8 +192,27 @@ ROWS = [
         for value, said in (
             (np.nan, "not finite; mend those pixels"),
             (np.inf, "not finite; mend those pixels"),
-            (-1.0, "negative; clip it at zero"),
+            (-1e-3, "negative; clip it at zero"),
         )
+    ),
+    *(
+        Row(
+            f"black{end}",
+            image(f"a{end}", 0.0, 0.0),
+            MAP,
+            "zero everywhere: the map is empty",
+        )
+        for end in lighting.ENDINGS
+    ),
+    *(
+        Row(f"{share} of a map{end}", cut(f"a{end}", share), MAP, "cannot be read")
+        for end in lighting.ENDINGS
+        for share in (0.001, 0.1, 0.5, 0.99)
+    ),
+    *(
+        Row(f"{name}, a{end}", holds(content, f"a{end}"), MAP, "cannot be read")
+        for end in (*lighting.ENDINGS, ".txt", ".png", "")
+        for name, content in (("empty", ""), ("words", "no image at all\n" * 20))
     ),
     Row("noise.hdr", holds(NOISE, "a.hdr"), MAP, "Unknown file format"),
     Row("PLY as HDR", holds(PLY, "a.hdr"), MAP, "Unknown file format"),
@@ -146,7 +220,12 @@ ROWS = [
         "enormous HDR", holds(huge(RGBE.format(10**6)), "a.hdr"), MAP, "cannot be read"
     ),
     Row("HDR of -8 rows", holds(huge(RGBE.format(-8)), "a.hdr"), MAP, "cannot be read"),
-    Row("enormous PFM", holds(huge("PF\n999999 999999\n-1\n"), "a.pfm"), MAP, "cannot"),
+    Row(
+        "enormous PFM",
+        holds(huge("PF\n999999 999999\n-1\n"), "a.pfm"),
+        MAP,
+        "cannot be read",
+    ),
 ]
 
 

@@ -57,7 +57,10 @@ TABLE: Table = {
         ({"normal": UP * 0}, "normals are .* not of unit length"),
         ({"light": np.ones((3, 20, 1))}, "the network takes no light: leave it out"),
         ({"network": LIT}, r"light is \(0,\), the network takes \[C 20 1\]"),
-        ({"network": LIT, "light": np.ones((3, 5, 1))}, "light is .3, 5, 1., the net"),
+        (
+            {"network": LIT, "light": np.ones((3, 5, 1))},
+            "light is .3, 5, 1., the network takes",
+        ),
         ({"network": LIT, "light": np.full((3, 20, 1), NAN)}, "light holds non-finite"),
         ({"limits": OTHER}, "the limits lack .*: they are of another network"),
     ],

@@ -237,11 +237,19 @@ def raising(error):
     ("error", "code", "message"),
     [
         (InputError("a: bad\nb"), 2, "error: a: bad b"),
-        (OSError(28, "No space left on device", "x/y"), 2, "x/y: No space left on dev"),
+        (
+            OSError(28, "No space left on device", "x/y"),
+            2,
+            "x/y: No space left on device",
+        ),
         (PermissionError(13, "Permission denied", "x"), 2, "x: Permission denied"),
         (MemoryError("Unable to allocate 9 TiB"), 2, "not enough memory"),
         (KeyboardInterrupt(), 130, "stopped"),
-        (ZeroDivisionError("two\nlines"), 1, "ours, ZeroDivisionError at test_bad_pl"),
+        (
+            ZeroDivisionError("two\nlines"),
+            1,
+            "ours, ZeroDivisionError at test_bad_places",
+        ),
         (OSError("no number"), 1, "a mistake of ours, OSError"),
         (AssertionError(), 1, "a mistake of ours, AssertionError"),
     ],

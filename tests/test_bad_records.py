@@ -91,7 +91,9 @@ ROWS = [
     Row("shard with a pickle", pickled, GREY, "damaged: delete it"),
     Row("lit: pickle", pickled, LIT, "damaged: delete it"),
     Row("shard is a folder", directory("a.npz"), GREY, "Is a directory.*: mend that"),
-    Row("of 2D points", shard(position=np.ones((20, 2))), GREY, "another kind"),
+    Row(
+        "of 2D points", shard(position=np.ones((20, 2))), GREY, "another kind of cloud"
+    ),
     Row("of unequal rows", shard(target=np.ones(19)), GREY, "another kind of cloud"),
     Row("of words", shard(target=np.array(["a"] * 20)), GREY, "another kind of cloud"),
     Row("without target", shard(target=None), GREY, "another kind of cloud"),
@@ -102,10 +104,20 @@ ROWS = [
     Row("half a record", run(text='{"training'), resume, "damaged: delete it"),
     Row("record of nothing", run(text="\0" * 99), resume, "damaged: delete it"),
     Row("deep record", run(text='{"a":' * 10**5), resume, "damaged: delete it"),
-    Row("record, limit inf", run({"limits": {"a": np.inf}}), resume, "damaged: delete"),
-    Row("record, limit -1", run({"limits": {"a": -1}}), resume, "damaged: delete"),
+    Row(
+        "record, limit inf",
+        run({"limits": {"a": np.inf}}),
+        resume,
+        "damaged: delete it",
+    ),
+    Row("record, limit -1", run({"limits": {"a": -1}}), resume, "damaged: delete it"),
     *(
-        Row(f"record, {n} {v}", with_training(**{n: v}), checkpoint.load_weights, "dam")
+        Row(
+            f"record, {n} {v}",
+            with_training(**{n: v}),
+            checkpoint.load_weights,
+            "damaged: train again",
+        )
         for n, v in (("steps", 0), ("points", "many"), ("network", {"levels": []}))
     ),
     Row(

@@ -1,7 +1,8 @@
 """Every capacity, driven to exactly what is needed and to one below.
 
-`test_packets`, `test_hierarchy` and `test_mcconv` do so by one cloud each, whose needs
-they count by hand; here clouds are drawn, and host-level calls are given too little.
+`test_packets`, `test_hierarchy` and `test_receptive_field` do so by one cloud each,
+whose needs they count by hand; here clouds are drawn, and host-level calls are given
+too little.
 """
 
 import re

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments import evaluate as experiment
-from ginn_jax import checkpoint, compare_networks, compare_report, image, scenes
+from ginn_jax import checkpoint, compare_networks, image, scenes
 from ginn_jax.compare_networks import OURS
 from ginn_jax.compare_report import (
     RIVALS,
@@ -122,12 +122,16 @@ def test_comparison_ends_in_a_report_and_keeps_its_references(tmp_path, monkeypa
     assert traced["4 rays"]["mse_2d"] < traced["1 rays"]["mse_2d"]
     text = (tmp_path / "out" / "report.md").read_text()
     assert all(name in text for name in names)
+    errors = {row["method"]: row["mse_2d"] for row in first["results"]}
+    lost = [line for line in first["lost_cells"] if "mse_2d: screen space" in line]
+    assert bool(lost) == (errors["screen space"] < errors[OURS])
+    assert all(line in text for line in first["lost_cells"])
     assert (tmp_path / "out" / "ablation.png").stat().st_size > 1000
     kept = next((tmp_path / "out" / "references").iterdir())
     before = kept.stat().st_mtime_ns
-    again = experiment.main(replace(options, seed=0))
+    again = experiment.main(options)
     assert kept.stat().st_mtime_ns == before
     for one, two in zip(first["results"], again["results"], strict=True):
         assert one["mse_2d"] == two["mse_2d"]
     stored = json.loads((tmp_path / "out" / "metrics.json").read_text())
-    assert stored["lost_cells"] == compare_report.lost_cells(stored["results"])
+    assert stored["lost_cells"] == again["lost_cells"]

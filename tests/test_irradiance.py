@@ -1,245 +1,37 @@
-"""Closed forms and conserved light, for direct and indirect irradiance."""
+"""Conserved light and closed forms of indirect irradiance, and of both together."""
 
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
+from rooms import (
+    LAMP,
+    WHITE,
+    copies,
+    cup,
+    floor,
+    joined,
+    quad,
+    sampled,
+    solid,
+    spread,
+    total,
+)
 
 from ginn_jax import irradiance
-from ginn_jax.errors import InputError
 from ginn_jax.irradiance import direct_irradiance, indirect_irradiance, light_scene
-from ginn_jax.lighting import (
-    EnvironmentMap,
-    PointLight,
-    constant_sky,
-    irradiance_of,
-    studio,
-)
-from ginn_jax.mesh import Mesh
+from ginn_jax.lighting import EnvironmentMap, constant_sky, irradiance_of, studio
 
-UP = np.array([0, 1, 0], np.float32)
-WHITE = np.ones((2, 3))
-BALL = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
-LAMP = PointLight(np.array([0.3, 1.2, 0.4]), np.array([1.0, 2.0, 5.0]))
-
-
-def quad(corner, edge_u, edge_v, material=0):
-    """A parallelogram whose normal is edge_u x edge_v."""
-    corner, u, v = np.array([corner, edge_u, edge_v], np.float32)
-    vertices = np.stack([corner, corner + u, corner + u + v, corner + v])
-    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    return Mesh(vertices, faces, np.full(2, material, np.int32))
-
-
-def joined(*parts):
-    starts = np.cumsum([0, *(len(p.vertices) for p in parts[:-1])])
-    faces = [p.faces + first for p, first in zip(parts, starts, strict=True)]
-    return Mesh(
-        np.concatenate([p.vertices for p in parts]),
-        np.concatenate(faces).astype(np.int32),
-        np.concatenate([p.material for p in parts]),
-    )
-
-
-def floor(half=1.0):
-    return quad((-half, 0, -half), (0, 0, 2 * half), (2 * half, 0, 0))
-
-
-def cup():
-    """A box of side 1 without lid, whose floor lies at y = 0; its walls are material 1.
-
-    All normals point inward.
-    """
-    return joined(
-        quad((0, 0, 0), (0, 0, 1), (1, 0, 0)),
-        quad((0, 0, 0), (0, 1, 0), (0, 0, 1), 1),
-        quad((1, 0, 0), (0, 0, 1), (0, 1, 0), 1),
-        quad((0, 0, 0), (1, 0, 0), (0, 1, 0), 1),
-        quad((0, 0, 1), (0, 1, 0), (1, 0, 0), 1),
-    )
-
-
-def ball():
-    return Mesh(
-        BALL.vertices.astype(np.float32),
-        BALL.faces.astype(np.int32),
-        np.zeros(len(BALL.faces), np.int32),
-    )
-
-
-def sampled(mesh, count, seed=0):
-    """Points of the surface, their normals as the faces are wound."""
-    shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    points, faces = trimesh.sample.sample_surface(shape, count, seed=seed)[:2]
-    edges = mesh.vertices[mesh.faces[faces]].astype(float)
-    normals = np.cross(edges[:, 1] - edges[:, 0], edges[:, 2] - edges[:, 0])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return points.astype(np.float32), normals.astype(np.float32)
-
-
-def copies(point, count, normal=UP):
-    return np.tile(np.float32(point), (count, 1)), np.tile(
-        np.float32(normal), (count, 1)
-    )
-
-
-def total(estimate):
-    """The mean over all points, and its standard deviation."""
-    mean = estimate.mean.astype(float).mean(0)
-    return mean, np.sqrt(estimate.variance.astype(float).sum(0)) / len(estimate.mean)
-
-
-def spread(values):
-    """The mean over all rows, and its standard deviation by their differences."""
-    values = values.astype(float)
-    return values.mean(0), values.std(0, ddof=1) / np.sqrt(len(values))
+BALL = solid(trimesh.creation.icosphere(subdivisions=2, radius=0.5))
 
 
 def scaled(light, factor):
     return EnvironmentMap(light.radiance * np.asarray(factor, np.float32))
 
 
-# Direct
-
-
-def test_open_plane_under_a_constant_sky():
-    """The mean is within .1 % of pi L, and no point is 1 % off."""
-    scene = light_scene(floor(), WHITE, constant_sky(2.0))
-    points, normals = sampled(floor(), 200)
-    found = direct_irradiance(scene, points, normals, samples=1024, seed=0)
-    np.testing.assert_allclose(found, 2 * np.pi, rtol=0.01)
-    np.testing.assert_allclose(found.mean(0), 2 * np.pi, rtol=1e-3)
-    under = direct_irradiance(scene, points, -normals, samples=1024, seed=0)
-    np.testing.assert_allclose(under, 2 * np.pi, rtol=0.01)
-
-
-def quadrature(light, normal, fine=4):
-    """Irradiance of a map whose first and last row lie on the poles, as Mitsuba's do.
-
-    Linear between rows; `fine` nodes a row.
-    """
-    height, width = light.radiance.shape[:2]
-    theta = (np.arange(height * fine) + 0.5) / (height * fine) * np.pi
-    phi = (np.arange(width) + 0.5) / width * 2 * np.pi
-    place = theta / np.pi * (height - 1)
-    row = place.astype(int)
-    share = (place - row)[:, None, None]
-    radiance = (1 - share) * light.radiance[row] + share * light.radiance[row + 1]
-    down, around = np.meshgrid(theta, phi, indexing="ij")
-    toward = [np.sin(around) * np.sin(down), np.cos(down), -np.cos(around)]
-    toward[2] *= np.sin(down)
-    cosine = np.maximum(np.tensordot(normal, toward, 1), 0)
-    weight = cosine * np.sin(down) * np.pi / len(theta) * 2 * np.pi / width
-    return (radiance * weight[..., None]).sum((0, 1))
-
-
-@pytest.mark.parametrize("light", [3, 8])
-def test_unshadowed_surface_has_the_irradiance_of_the_map(light):
-    """For any normal, and the more exactly the more directions are looked in.
-
-    By `irradiance_of` only to 5 %, as it has the first row half a row below the pole.
-    """
-    light = studio(light)
-    scene = light_scene(floor(1e-3), WHITE, light)
-    normals = np.random.default_rng(0).normal(size=(10, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    # Far from the mesh, which then hides nothing.
-    points = np.tile(np.float32([5, 5, 5]), (10, 1))
-    exact = np.array([quadrature(light, n) for n in normals])
-    for samples, rtol in [(1024, 0.05), (65536, 2e-3)]:
-        found = direct_irradiance(
-            scene, points, normals.astype(np.float32), samples=samples, seed=0
-        )
-        np.testing.assert_allclose(found, exact, rtol=rtol)
-    simple = np.array([irradiance_of(light, n) for n in normals])
-    np.testing.assert_allclose(simple, exact, rtol=0.05)
-
-
-@settings(max_examples=30)
-@given(hnp.arrays(np.float32, (8, 2), elements=st.floats(-1, 1, width=32)))
-def test_plane_under_a_point_light(place):
-    """Intensity times cosine over the distance squared, to float32's rounding."""
-    scene = light_scene(floor(2), WHITE, LAMP)
-    points = np.insert(place, 1, 0, axis=1)
-    found = direct_irradiance(
-        scene, points, np.tile(UP, (8, 1)), samples=1 + len(place), seed=1
-    )
-    toward = LAMP.position - points
-    distance = np.linalg.norm(toward, axis=1, keepdims=True)
-    expected = LAMP.intensity * toward[:, 1:2] / distance**3
-    np.testing.assert_allclose(found, expected, rtol=2e-4)
-
-
-def test_shadow_of_a_point_light_is_black():
-    """A square halfway up casts a shadow of twice its size."""
-    light = PointLight(np.array([0.0, 1.0, 0.0]), np.ones(3))
-    lid = quad((-0.1, 0.5, -0.1), (0, 0, 0.2), (0.2, 0, 0))
-    scene = light_scene(joined(floor(), lid), WHITE, light)
-    x = np.linspace(-0.9, 0.9, 61, dtype=np.float32)
-    points = np.stack(np.meshgrid(x, [0], x), axis=-1).reshape(-1, 3)
-    points = points.astype(np.float32)
-    normals = np.tile(UP, (len(points), 1))
-    found = direct_irradiance(scene, points, normals, samples=1, seed=0)
-    dark = np.abs(points).max(axis=1) < 0.2
-    assert 0 < dark.sum() < len(points)
-    np.testing.assert_array_equal(found[dark], 0)
-    assert found[~dark].min() > 0
-    behind = direct_irradiance(scene, points, -normals, samples=1, seed=0)
-    np.testing.assert_array_equal(behind, 0)
-
-
-def test_wall_hides_half_the_sky():
-    wall = quad((0, 0, -100), (0, 100, 0), (0, 0, 200))
-    scene = light_scene(joined(floor(100), wall), WHITE, constant_sky())
-    points, normals = copies((0.05, 0, 0), 200)
-    found = direct_irradiance(scene, points, normals, samples=256, seed=0)
-    mean, sigma = spread(found)
-    assert (sigma < 0.01).all()
-    np.testing.assert_allclose(mean, np.pi / 2, atol=4 * sigma.max() + 2e-3)
-
-
-def test_two_maps_together_give_both_their_irradiance():
-    one, two = studio(1), studio(2)
-    both = EnvironmentMap(one.radiance + two.radiance)
-    points, normals = copies((0.2, 0, 0.3), 128)
-    scenes = [light_scene(cup(), WHITE, light) for light in (one, two, both)]
-    found = [
-        spread(direct_irradiance(s, points, normals, samples=256, seed=i))
-        for i, s in enumerate(scenes)
-    ]
-    mean, sigma = np.array(found).transpose(1, 0, 2)
-    assert mean[:2].min() > 0
-    assert (sigma < 0.02 * mean).all()
-    assert (np.abs(mean[0] + mean[1] - mean[2]) < 4.5 * sigma.sum(0)).all()
-
-
-def test_chunks_do_not_matter_for_direct_light(monkeypatch):
-    scene = light_scene(cup(), WHITE, studio(1))
-    points, normals = sampled(cup(), 60)
-
-    def look(count, seed):
-        return direct_irradiance(
-            scene, points[:count], normals[:count], samples=16, seed=seed
-        )
-
-    whole = look(60, 7)
-    np.testing.assert_array_equal(whole, look(60, 7))
-    np.testing.assert_array_equal(whole[:20], look(20, 7))
-    assert (whole != look(60, 8)).any()
-    for most in (16, 16 * 7, 16 * 59):
-        monkeypatch.setattr(irradiance, "PATHS_PER_LAUNCH", most)
-        np.testing.assert_array_equal(whole, look(60, 7))
-
-
-# Indirect
-
-
 @pytest.mark.parametrize("light", [constant_sky(3.0), studio(1), LAMP])
 def test_convex_object_alone_lights_itself_by_nothing(light):
-    scene = light_scene(ball(), WHITE, light)
-    points, normals = sampled(ball(), 3000)
+    scene = light_scene(BALL, WHITE, light)
+    points, normals = sampled(BALL, 3000)
     found = indirect_irradiance(scene, points, normals, paths=16, seed=0)
     np.testing.assert_array_equal(found.mean, 0)
     np.testing.assert_array_equal(found.variance, 0)
@@ -451,58 +243,3 @@ def test_no_points_and_one_path():
     one = indirect_irradiance(scene, points, normals, paths=1, seed=0)
     assert np.isfinite(one.mean).all()
     assert np.isnan(one.variance).all()
-
-
-# Mistakes
-
-
-def assert_one_line(caught, message):
-    assert message in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("albedo", "message"),
-    [
-        (np.full((2, 3), 1.001), "above 1"),
-        (np.full((2, 3), -0.001), "not negative"),
-        (np.full((2, 3), np.nan), "not negative"),
-        (np.full((2, 3), np.inf), "above 1"),
-        (np.full((1, 3), 0.5), "1 albedos"),
-        (np.zeros((0, 3)), "0 albedos"),
-        (np.full(3, 0.5), "[K 3]"),
-        (np.full((2, 4), 0.5), "[K 3]"),
-    ],
-)
-def test_bad_albedo_is_refused(albedo, message, unchecked):
-    with pytest.raises(InputError) as caught:
-        light_scene(cup(), albedo, constant_sky())
-    assert_one_line(caught, message)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"points": np.zeros((3, 2), np.float32)}, "N, 3"),
-        ({"normals": np.tile(UP, (4, 1))}, "N, 3"),
-        ({"points": np.full((3, 3), np.nan, np.float32)}, "finite"),
-        ({"normals": np.full((3, 3), np.nan, np.float32)}, "unit"),
-        ({"normals": np.full((3, 3), 0.5, np.float32)}, "unit"),
-        ({"count": 0}, "from 1"),
-        ({"count": -3}, "from 1"),
-        ({"count": irradiance.PATHS_PER_LAUNCH + 1}, "from 1"),
-        ({"seed": -1}, "seed"),
-        ({"seed": 2**32}, "seed"),
-    ],
-)
-def test_bad_input_is_refused(change, message, unchecked):
-    scene = light_scene(floor(), WHITE, constant_sky())
-    points, normals = copies((0, 0, 0), 3)
-    given = {"points": points, "normals": normals, "count": 4, "seed": 0} | change
-    count, ends = given.pop("count"), (given.pop("points"), given.pop("normals"))
-    with pytest.raises(InputError) as caught:
-        direct_irradiance(scene, *ends, samples=count, **given)
-    assert_one_line(caught, message)
-    with pytest.raises(InputError) as caught:
-        indirect_irradiance(scene, *ends, paths=count, **given)
-    assert_one_line(caught, message)

@@ -158,7 +158,6 @@ def test_relight_benchmark(tmp_path, monkeypatch):
         metrics = relight_benchmark.main(options)
     [row] = metrics["rows"]
     assert row["largest_difference"] < 1e-3
-    assert row["saving"] > 0
     with pytest.raises(InputError, match="no network"):
         relight_benchmark.main(replace(options, networks=("none",)))
 
@@ -169,4 +168,3 @@ def test_generation_benchmark(tmp_path):
     )
     [row] = generation.main(options)["rows"]
     assert row["mean_difference"] < 0.1
-    assert row["ours"] > 0

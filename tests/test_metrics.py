@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from jaxtyping import TypeCheckError
 
 from ginn_jax import metrics
 from ginn_jax.errors import InputError
@@ -155,18 +154,18 @@ def test_tone_map_ignores_exposure_and_stays_in_range(image, exposure):
 
 
 @pytest.mark.parametrize(
-    ("a", "b", "mask"),
+    ("b", "mask", "message"),
     [
-        (np.zeros((12, 12)), np.zeros((12, 13)), None),
-        (np.zeros((12, 12)), np.zeros((12, 12)), np.ones((12, 11), bool)),
-        (np.zeros((12, 12)), np.zeros((12, 12)), np.ones((12, 12))),
-        (np.zeros((12, 12)), np.full((12, 12), np.nan), None),
+        (np.zeros((12, 13)), None, r"shapes \(12, 12\) and \(12, 13\) differ"),
+        (np.zeros((12, 12)), np.ones((12, 11), bool), r"mask bool\(12, 11\) does not"),
+        (np.zeros((12, 12)), np.ones((12, 12)), r"mask float64\(12, 12\) does not fit"),
+        (np.full((12, 12), np.nan), None, "values to compare are not finite"),
     ],
 )
-def test_what_does_not_fit_is_refused(a, b, mask):
+def test_what_does_not_fit_is_refused(b, mask, message, unchecked):
     for metric in (metrics.mse, metrics.dssim):
-        with pytest.raises((InputError, TypeCheckError)):
-            metric(a, b, mask)
+        with pytest.raises(InputError, match=message):
+            metric(np.zeros((12, 12)), b, mask)
 
 
 def test_dssim_refuses_small_images():

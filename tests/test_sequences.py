@@ -29,6 +29,8 @@ def test_frames_share_a_unit_box_and_a_ground():
 def test_samples_move_with_their_faces():
     meshes = sequences.frames_of(DATA, 5, ground=True)
     carried = sequences.carried_samples(meshes[0], 500, seed=1)
+    np.testing.assert_allclose(carried.barycentric.sum(1), 1, atol=1e-4)
+    assert carried.barycentric.min() > -1e-4
     for mesh in meshes:
         samples = sequences.samples_at(mesh, carried)
         corners = mesh.vertices[mesh.faces[carried.face]].astype(float)
