@@ -1,5 +1,6 @@
 """Benchmarks, one script per question: `python -m benchmarks.NAME`.
 
-Each takes --quick and --out DIR, and writes metrics.json, report.md and a figure there.
+Each takes --out DIR, where it writes metrics.json, report.md and what figures it has,
+and --quick but for `paper_tables`, which only sets other reports side by side.
 Times are wall times, compilation apart, of variants that take turns in one process.
 """

@@ -43,7 +43,7 @@ from ginn_jax.train import (
 # Each stage and what it adds to the one before.
 STAGES = {
     "levels": "Poisson disk (and augmentation)",
-    "edges": "hash and search",
+    "edges": "voxels and search",
     "geometry": "densities, kernel inputs",
     "forward": "forward",
     "gradient": "gradient",

@@ -11,6 +11,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     checks            what public functions ask of their arguments
     files             checked before they are read, written whole or not
     process           settings of a process that make XLA faster on CPU
+    commandline       options, one-line errors and exit codes of scripts
     orientation, mesh_files, mesh    triangles: loading, mending, ground, samples
     sdf, solids, *_shapes, shapes    the seeded source of procedural objects
     camera            pinhole cameras
@@ -22,7 +23,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     slab              albedo of a thick slab of a medium, and its inverse
     subsurface        radiant exitance by random walks in a medium
     objects           which objects and lights there are, and which go together
-    voxels            fixed-capacity voxel hash under jit
+    voxels            points sorted by voxel, found by binary search under jit
     candidates        points that packets of queries may be near
     packets           radius search by packets of queries under jit
     neighbors         radius search on the host: exact, sizes itself

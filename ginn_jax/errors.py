@@ -13,4 +13,4 @@ class InputError(ValueError):
 
 
 class InputWarning(UserWarning):
-    """Input that was mended on the way in; the message says how."""
+    """Input that was mended on the way in or costs accuracy; the message says how."""

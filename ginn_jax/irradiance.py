@@ -4,6 +4,7 @@ Points and pixels go through the same functions. All surfaces are diffuse; mater
 an RGB albedo for each material index of the mesh (0 object, 1 ground).
 """
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from ginn_jax.checks import LARGEST_SEED, real_array, unit_rows, whole
 from ginn_jax.errors import InputError
 from ginn_jax.lighting import EnvironmentMap, Light, check_light
 from ginn_jax.mesh import Mesh, check_mesh
-from ginn_jax.reference import OFFSET, columns, random_pair
+from ginn_jax.reference import OFFSET, columns, launches, random_pair
 from ginn_jax.renderer import use_mitsuba
 
 PATHS_PER_LAUNCH = 2**22
@@ -122,10 +123,9 @@ def direct_irradiance(
     unit_rows(points, normals)
     check_draws("samples", samples, seed)
     samples = samples if isinstance(scene.light, EnvironmentMap) else 1
-    size = max(1, min(PATHS_PER_LAUNCH // samples, len(points)))
     parts = [
-        _direct(scene, points[i : i + size], normals[i : i + size], i, samples, seed)
-        for i in range(0, len(points), size)
+        _direct(scene, *launch, samples, seed)
+        for launch in launches(points, normals, samples, PATHS_PER_LAUNCH)
     ]
     return np.concatenate([np.zeros((0, 3), np.float32), *parts])
 
@@ -142,7 +142,7 @@ def _direct(
     import drjit as dr
 
     with mi.variant_context(variant):
-        point, ray, at, normal = _lanes(scene, points, normals, samples)
+        point, ray, at, normal = lanes(scene, points, normals, samples)
         number = point + dr.opaque(mi.UInt32, first)
         shift = random_pair(number, mi.UInt32(0), dr.opaque(mi.UInt32, seed))
         # In words, whose multiples wrap around and stay exact however many they are.
@@ -176,15 +176,17 @@ def indirect_irradiance(
     """
     unit_rows(points, normals)
     check_draws("paths", paths, seed)
-    size = max(1, min(PATHS_PER_LAUNCH // paths, len(points)))
-    parts = [
-        _indirect(scene, points[i : i + size], normals[i : i + size], i, paths, seed)
-        for i in range(0, len(points), size)
-    ]
+    return joined(
+        _indirect(scene, *launch, paths, seed)
+        for launch in launches(points, normals, paths, PATHS_PER_LAUNCH)
+    )
+
+
+def joined(parts: Iterable[ColorEstimate]) -> ColorEstimate:
+    """The estimates of all parts of some points, in their order."""
     nothing = np.zeros((0, 3), np.float32)
-    mean = np.concatenate([nothing, *(part.mean for part in parts)])
-    variance = np.concatenate([nothing, *(part.variance for part in parts)])
-    return ColorEstimate(mean, variance)
+    numbers = zip((nothing, nothing), *parts, strict=True)
+    return ColorEstimate(*(np.concatenate(number) for number in numbers))
 
 
 def check_draws(name: str, count: int, seed: int) -> None:
@@ -205,7 +207,7 @@ def _indirect(
     import drjit as dr
 
     with mi.variant_context(variant):
-        _, _, at, normal = _lanes(scene, points, normals, paths)
+        _, _, at, normal = lanes(scene, points, normals, paths)
         sampler = mi.load_dict({"type": "independent"})
         number = np.random.SeedSequence((seed, first)).generate_state(1)[0]
         sampler.seed(dr.opaque(mi.UInt32, int(number)), len(points) * paths)
@@ -235,7 +237,7 @@ def summarize(values: Any, paths: int) -> ColorEstimate:
     return ColorEstimate(middle.astype(np.float32), variance.astype(np.float32))
 
 
-def _lanes(
+def lanes(
     scene: LitScene,
     points: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],

@@ -4,6 +4,7 @@ Two effects: global illumination, of a diffuse object on diffuse ground, and sub
 scattering, of a translucent object in the air.
 """
 
+import warnings
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ginn_jax.checks import positive, whole
-from ginn_jax.errors import InputError
+from ginn_jax.errors import InputError, InputWarning
 from ginn_jax.irradiance import (
     ColorEstimate,
     LitScene,
@@ -20,7 +21,6 @@ from ginn_jax.irradiance import (
     light_scene,
 )
 from ginn_jax.lighting import Light
-from ginn_jax.limits import LOG
 from ginn_jax.lit_clouds import LitCloud
 from ginn_jax.mesh import Mesh, Samples, sample_surface
 from ginn_jax.objects import Source, load_light, load_object
@@ -143,10 +143,11 @@ def transport(
     ends = lit.scene, medium, position, normal
     found, lost = subsurface_exitance(*ends, paths=paths, seed=seed)
     if lost > MOST_LOST:
-        LOG.warning(
-            "%.0f %% of the walks in the medium left it by holes of the mesh and count "
-            "as dark: close them",
-            100 * lost,
+        warnings.warn(
+            f"{lost:.0%} of the walks in the medium left it by holes of the mesh and "
+            "count as dark: close them",
+            InputWarning,
+            stacklevel=2,
         )
     return found
 

@@ -63,16 +63,28 @@ def ambient_occlusion(
     """
     scene = mesh if isinstance(mesh, Scene) else build_scene(mesh)
     _check_rays(points, normals, radius, rays, seed)
-    size = max(1, min(RAYS_PER_LAUNCH // rays, len(points)))
     blocked = [
-        _count_blocked(
-            scene, points[i : i + size], normals[i : i + size], i, radius, rays, seed
-        )
-        for i in range(0, len(points), size)
+        _count_blocked(scene, *launch, radius, rays, seed)
+        for launch in launches(points, normals, rays, RAYS_PER_LAUNCH)
     ]
     p = 1 - np.concatenate([np.zeros(0), *blocked]) / rays
     variance = p * (1 - p) / (rays - 1) if rays > 1 else np.full_like(p, np.nan)
     return Estimate(p.astype(np.float32), variance.astype(np.float32))
+
+
+def launches(
+    points: Float[np.ndarray, "N 3"],
+    normals: Float[np.ndarray, "N 3"],
+    each: int,
+    most: int,
+) -> list[tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], int]]:
+    """Points and normals in parts of at most `most` rays, `each` a point.
+
+    With every part comes the number of its first point.
+    """
+    size = max(1, min(most // each, len(points)))
+    starts = range(0, len(points), size)
+    return [(points[i : i + size], normals[i : i + size], i) for i in starts]
 
 
 def build_scene(mesh: Mesh) -> Scene:

@@ -16,7 +16,7 @@ from ginn_jax.checks import number, real_array, unit_rows
 from ginn_jax.errors import InputError
 from ginn_jax.irradiance import ColorEstimate, LitScene
 from ginn_jax.lighting import EnvironmentMap
-from ginn_jax.reference import OFFSET
+from ginn_jax.reference import OFFSET, launches
 from ginn_jax.renderer import use_mitsuba
 from ginn_jax.slab import single_scattering_albedo
 
@@ -65,15 +65,12 @@ def subsurface_exitance(
     _check_medium(medium, paths, seed)
     if not (scene.mesh.material == 0).any():
         raise InputError("the scene has no face of material 0 to enclose a medium")
-    size = max(1, min(irradiance.PATHS_PER_LAUNCH // paths, len(points)))
-    starts = range(0, len(points), size)
-    chunks = [(points[i : i + size], normals[i : i + size], i) for i in starts]
-    parts = [_exitance(scene, medium, *chunk, paths, seed) for chunk in chunks]
-    nothing = np.zeros((0, 3), np.float32)
-    mean = np.concatenate([nothing, *(part.mean for part, _ in parts)])
-    variance = np.concatenate([nothing, *(part.variance for part, _ in parts)])
+    parts = [
+        _exitance(scene, medium, *launch, paths, seed)
+        for launch in launches(points, normals, paths, irradiance.PATHS_PER_LAUNCH)
+    ]
     lost = sum(count for _, count in parts) / max(len(points) * paths, 1)
-    return ColorEstimate(mean, variance), lost
+    return irradiance.joined(part for part, _ in parts), lost
 
 
 def _check_medium(medium: Medium, paths: int, seed: int) -> None:
@@ -104,7 +101,7 @@ def _exitance(
     import drjit as dr
 
     with mi.variant_context(variant):
-        _, _, at, inward = irradiance._lanes(scene, points, -normals, paths)
+        _, _, at, inward = irradiance.lanes(scene, points, -normals, paths)
         sampler = mi.load_dict({"type": "independent"})
         number = np.random.SeedSequence((seed, first)).generate_state(1)[0]
         sampler.seed(dr.opaque(mi.UInt32, int(number)), len(points) * paths)

@@ -1,5 +1,8 @@
 """From a source to a lit cloud, and to a file that is made once."""
 
+import re
+import warnings
+
 import numpy as np
 import pytest
 import tiny
@@ -8,7 +11,7 @@ from hypothesis import given
 from strategies import SEEDS
 
 from ginn_jax import scenes
-from ginn_jax.errors import InputError
+from ginn_jax.errors import InputError, InputWarning
 from ginn_jax.lit_clouds import load_lit_cloud
 from ginn_jax.lit_scenes import (
     DENSEST,
@@ -16,12 +19,15 @@ from ginn_jax.lit_scenes import (
     Scattering,
     draw_albedo,
     draw_medium,
+    light_mesh,
     light_up,
     lit_cloud,
+    transport,
 )
 from ginn_jax.objects import (
     file_sources,
     load_light,
+    load_object,
     pair_up,
     point_lights,
     procedural_lights,
@@ -160,6 +166,24 @@ def test_materials_are_drawn_as_the_paper_says():
         kept = np.exp(-share)
         error = 4 * np.sqrt(kept * (1 - kept) / 500)
         assert (extinction > 10 * share).mean() == pytest.approx(kept, abs=error)
+
+
+def test_a_mesh_that_does_not_hold_its_medium_is_told(sources):
+    source = sources[0]
+    ball = load_object(source, ground=False)
+    half = ball._replace(faces=ball.faces[ball.vertices[ball.faces, 1].mean(1) < 0])
+    half = half._replace(material=half.material[: len(half.faces)])
+    thin = Scattering(size=1.0, **SMALL)
+    for mesh, loses in ((ball, False), (half, True)):
+        lit = light_mesh(mesh, load_light(source), thin, seed=0)
+        low = mesh.vertices[mesh.vertices[:, 1] < -0.3]
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            transport(lit, low, 2 * low, paths=8, seed=0)
+        assert [w.category for w in told] == [InputWarning] * loses
+        assert all(
+            re.search(r"\d+% of the walks .* holes", str(w.message)) for w in told
+        )
 
 
 # Files
