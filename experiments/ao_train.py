@@ -16,6 +16,7 @@ import numpy as np
 from rich.console import Console
 
 from ginn_jax import architecture, evaluate, fit, objects, report, scenes
+from ginn_jax.architecture import Network
 from ginn_jax.commandline import require_positive, start
 from ginn_jax.disk_radius import limits_at, with_disk_radius
 from ginn_jax.experiment import (
@@ -29,6 +30,7 @@ from ginn_jax.experiment import (
 )
 from ginn_jax.limits import Limits
 from ginn_jax.mesh import find_meshes
+from ginn_jax.occlusion_report import write_report
 from ginn_jax.train import Training
 
 VALIDATION_RAYS = 1024
@@ -162,13 +164,6 @@ def image_evaluation(
     shown: list[tuple[objects.Source, scenes.ShadedPoints]],
 ) -> dict[str, Any]:
     """Images of unseen objects, and error against run time on the same pixels."""
-    pictures, rows = [], []
-    network = config.network
-    own = network.levels[0]
-    others = (
-        [] if options.quick else [r for r in DISK_RADII if r < network.query.radius]
-    )
-    radii = sorted({own, *others})
     views = [
         evaluate.reference_view(
             objects.load_object(source),
@@ -179,22 +174,15 @@ def image_evaluation(
         )
         for i, (source, _) in enumerate(shown)
     ]
-    for radius in radii:
-        held, variant = (
-            limits_at(network, limits, radius),
-            with_disk_radius(network, radius),
-        )
-        for (source, whole), view in zip(shown, views, strict=True):
-            cloud = evaluate.split_cloud(whole)[0]
-            row, image, held = evaluate.network_row(variant, held, model, cloud, view)
-            rows.append(row | {"name": source.name})
-            if radius == own:
-                pictures.append((source.name, view.reference, image))
-            if radius == own and options.resolution_scale < 1:
-                row, _, held = evaluate.network_row(
-                    variant, held, model, cloud, view, options.resolution_scale
-                )
-                rows.append(row | {"name": source.name})
+    own, rows, pictures = config.network.levels[0], [], []
+    for radius in disk_radii(config.network, options.quick):
+        scales = {1.0, options.resolution_scale} if radius == own else {1.0}
+        given = config.network, limits, model, views, shown, radius
+        for scale in sorted(scales, reverse=True):
+            found, images = network_rows(*given, scale)
+            rows += found
+            if (radius, scale) == (own, 1.0):
+                pictures = images
     for i, view in enumerate(views):
         for rays in RAY_COUNTS:
             row = evaluate.ray_row(view, options.radius, rays, seed=1000 + i)
@@ -216,58 +204,31 @@ def image_evaluation(
     }
 
 
-def write_report(m: dict[str, Any]) -> str:
-    """report.md: what was done, how good it is, how long it took."""
-    columns = {"name": "object", "points": "points", "mse_3d": "3D MSE"}
-    columns |= {"relative_mse_3d": "relative", "noise_floor_3d": "noise floor"}
-    times = {"method": "method", "points": "points", "mse_2d": "2D MSE"}
-    times |= {"dssim_2d": "DSSIM", "seconds_3d": "f_3D s", "seconds_2d": "f_2D s"}
-    times |= {"seconds": "total s"}
-    pooled = [{"set": "unseen procedural shapes", **m}]
-    if "unseen_meshes_pooled" in m:
-        pooled.append({"set": "unseen meshes", **m["unseen_meshes_pooled"]})
-    heads = {"set": "set", "clouds": "clouds", "mse_3d": "3D MSE"}
-    heads |= {"relative_mse_3d": "relative 3D MSE", "noise_floor_3d": "noise floor"}
-    heads |= {"median_relative_mse_3d": "median relative", "equal_rays": "equal rays"}
-    env, options = m["environment"], m["options"]
-    seconds = {k[8:]: v for k, v in m.items() if k.startswith("seconds_")}
-    return f"""# Ambient occlusion
+def disk_radii(network: Network, quick: bool) -> list[float]:
+    """The network's own finest disk radius and, unless in a hurry, others it allows."""
+    others = [r for r in DISK_RADII if r < network.query.radius and not quick]
+    return sorted({network.levels[0], *others})
 
-Preset {options["preset"]}, levels {m["training"]["network"]["levels"]}, f_2D radius
-{m["training"]["network"]["query"]["radius"]}, {m["steps"]} steps of
-{options["batch"]} clouds, occlusion radius {options["radius"]}, seed {options["seed"]}.
-{env["processor"]}, {env["cores"]} cores, {env["devices"]} JAX devices,
-jax {env["packages"]["jax"]}, mitsuba {env["packages"]["mitsuba"]}.
-Skipped steps (non-finite gradient): {m["skipped_steps"]}. Limits raised on the way:
-{", ".join(m["limits_raised"]) or "none"}. Peak memory {m["peak_memory_gib"]:.2f} GiB.
 
-## Error at points
-
-MSE is against the expectation of the ray-traced target (its noise is subtracted);
-relative is over the variance of the target, pooled over the clouds; equal rays is the
-number of rays per point at which ray tracing has the same MSE.
-
-{report.table_of(pooled, heads)}
-## Error against run time
-
-Means over {len(m["foreground_pixels"])} unseen objects at {options["resolution"]} x
-{options["resolution"]} ({", ".join(map(str, m["foreground_pixels"]))} foreground
-pixels), same pixels, same machine, same run; compilation and G-buffer apart. DSSIM
-after the paper's tone mapping, over the foreground.
-
-{report.table_of(m["error_against_time"], times)}
-![error against run time](error_against_time.png)
-
-![reference, network, difference](views.png)
-
-## Training
-
-![learning curve](learning_curve.png)
-
-{report.markdown_table(list(seconds), [[f"{v:.1f} s" for v in seconds.values()]])}
-## Every unseen object
-
-{report.table_of(m["unseen_shapes"] + m.get("unseen_meshes", []), columns)}"""
+def network_rows(
+    network: Network,
+    limits: Limits,
+    model: evaluate.Model,
+    views: list[evaluate.View],
+    shown: list[tuple[objects.Source, scenes.ShadedPoints]],
+    radius: float,
+    scale: float,
+) -> tuple[list[evaluate.Row], list[Any]]:
+    """Errors and times at one disk radius and resolution scale, and the images."""
+    held, rows, images = limits_at(network, limits, radius), [], []
+    network = with_disk_radius(network, radius)
+    for (source, whole), view in zip(shown, views, strict=True):
+        cloud = evaluate.split_cloud(whole)[0]
+        given = network, held, model, cloud, view, scale
+        row, image, held = evaluate.network_row(*given)
+        rows.append(row | {"name": source.name})
+        images.append((source.name, view.reference, image))
+    return rows, images
 
 
 if __name__ == "__main__":

@@ -65,6 +65,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     experiment        what every experiment does around its effect
     compare_report    lost cells, Pareto front and figures of a comparison
     sequences         animated meshes, samples that move with them, flicker
+    occlusion_report  report.md of the experiment of ambient occlusion
     lit_report        report.md of effects that carry light
     lit_experiment    what the experiments of effects that carry light share
 

@@ -1,0 +1,59 @@
+"""report.md of the experiment of ambient occlusion."""
+
+from typing import Any
+
+from ginn_jax import report
+
+
+def write_report(m: dict[str, Any]) -> str:
+    """report.md: what was done, how good it is, how long it took."""
+    columns = {"name": "object", "points": "points", "mse_3d": "3D MSE"}
+    columns |= {"relative_mse_3d": "relative", "noise_floor_3d": "noise floor"}
+    times = {"method": "method", "points": "points", "mse_2d": "2D MSE"}
+    times |= {"dssim_2d": "DSSIM", "seconds_3d": "f_3D s", "seconds_2d": "f_2D s"}
+    times |= {"seconds": "total s"}
+    pooled = [{"set": "unseen procedural shapes", **m}]
+    if "unseen_meshes_pooled" in m:
+        pooled.append({"set": "unseen meshes", **m["unseen_meshes_pooled"]})
+    heads = {"set": "set", "clouds": "clouds", "mse_3d": "3D MSE"}
+    heads |= {"relative_mse_3d": "relative 3D MSE", "noise_floor_3d": "noise floor"}
+    heads |= {"median_relative_mse_3d": "median relative", "equal_rays": "equal rays"}
+    env, options = m["environment"], m["options"]
+    seconds = {k[8:]: v for k, v in m.items() if k.startswith("seconds_")}
+    return f"""# Ambient occlusion
+
+Preset {options["preset"]}, levels {m["training"]["network"]["levels"]}, f_2D radius
+{m["training"]["network"]["query"]["radius"]}, {m["steps"]} steps of
+{options["batch"]} clouds, occlusion radius {options["radius"]}, seed {options["seed"]}.
+{env["processor"]}, {env["cores"]} cores, {env["devices"]} JAX devices,
+jax {env["packages"]["jax"]}, mitsuba {env["packages"]["mitsuba"]}.
+Skipped steps (non-finite gradient): {m["skipped_steps"]}. Limits raised on the way:
+{", ".join(m["limits_raised"]) or "none"}. Peak memory {m["peak_memory_gib"]:.2f} GiB.
+
+## Error at points
+
+MSE is against the expectation of the ray-traced target (its noise is subtracted);
+relative is over the variance of the target, pooled over the clouds; equal rays is the
+number of rays per point at which ray tracing has the same MSE.
+
+{report.table_of(pooled, heads)}
+## Error against run time
+
+Means over {len(m["foreground_pixels"])} unseen objects at {options["resolution"]} x
+{options["resolution"]} ({", ".join(map(str, m["foreground_pixels"]))} foreground
+pixels), same pixels, same machine, same run; compilation and G-buffer apart. DSSIM
+after the paper's tone mapping, over the foreground.
+
+{report.table_of(m["error_against_time"], times)}
+![error against run time](error_against_time.png)
+
+![reference, network, difference](views.png)
+
+## Training
+
+![learning curve](learning_curve.png)
+
+{report.markdown_table(list(seconds), [[f"{v:.1f} s" for v in seconds.values()]])}
+## Every unseen object
+
+{report.table_of(m["unseen_shapes"] + m.get("unseen_meshes", []), columns)}"""
