@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from rich.console import Console
 
-from ginn_jax import compare, compare_report, evaluate_light, report, sequences
+from ginn_jax import compare, compare_report, report, sequences
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
 from ginn_jax.compare import Shot, Stage
@@ -24,7 +24,7 @@ from ginn_jax.compare_networks import Trained, load_networks, network_values
 from ginn_jax.compare_screen import screen_pictures
 from ginn_jax.compare_tracing import trace
 from ginn_jax.dataset import ShadedPoints
-from ginn_jax.evaluate import View
+from ginn_jax.evaluate import View, fill
 from ginn_jax.experiment import bar
 from ginn_jax.lighting import Light, load_environment, procedural_environment
 from ginn_jax.lit_clouds import mean_light
@@ -140,7 +140,7 @@ def shade_frame(
     for name, trained in networks.items():
         values[name], networks[name] = network_values(trained, given, shot)
     mask = shot.gbuffer.mask
-    images = {n: evaluate_light.fill(mask, np.asarray(v)) for n, v in values.items()}
+    images = {n: fill(mask, np.asarray(v)) for n, v in values.items()}
     return images | {"mask": mask, "albedo": albedo_of(shot)}, networks
 
 
@@ -165,7 +165,7 @@ def albedo_of(shot: Shot) -> np.ndarray:
     albedo = shot.pixels.albedo[shot.pixels.material]
     if shot.pixels.medium.size:
         albedo = np.ones_like(albedo)
-    return evaluate_light.fill(mask, albedo)
+    return fill(mask, albedo)
 
 
 def measure(options: Options, frames: dict[str, np.ndarray]) -> dict[str, Any]:

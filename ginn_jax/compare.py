@@ -64,14 +64,16 @@ def displayed(shot: Shot, pictures: list[Picture]) -> dict[str, np.ndarray]:
     values["reference"] = target_of(shot)
     if isinstance(shot, View):
         mask = shot.gbuffer.mask
-        return {name: evaluate_light.fill(mask, v) for name, v in values.items()}
+        return {name: evaluate.fill(mask, v) for name, v in values.items()}
     return {name: evaluate_light.displayed(shot, v) for name, v in values.items()}
 
 
 def errors(shot: Shot, values: Values, units: Float[np.ndarray, "C"] | None) -> Row:
     """2D errors of a picture; `units` are those of the light, see `evaluate_light`."""
     if isinstance(shot, View):
-        row = evaluate.image_errors(shot, evaluate.fill(shot.gbuffer.mask, values))
+        row = evaluate.image_errors(
+            shot, evaluate.fill(shot.gbuffer.mask, values, evaluate.OPEN)
+        )
     else:
         assert units is not None
         row = evaluate_light.lit_image_errors(shot, values, units)

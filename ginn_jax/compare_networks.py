@@ -107,7 +107,7 @@ def errors_at_points(
             found[name] = evaluate.pool_rows(rows)
         else:
             rows, limits = evaluate_light.evaluate_lit_clouds(*given, settings)
-            found[name] = evaluate_light.pool_lit_rows(rows)
+            found[name] = evaluate.pool_rows(rows)
         networks[name] = network, limits, model
     return found, networks
 

@@ -7,10 +7,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from ginn_jax import evaluate_light
 from ginn_jax.camera import Camera
 from ginn_jax.compare import Picture, Shot, errors, scratch_mib
-from ginn_jax.evaluate import View, timed
+from ginn_jax.evaluate import View, fill, timed
 from ginn_jax.lit_scenes import Scattering
 from ginn_jax.scenes import Occlusion, Settings
 from ginn_jax.screen_bounce import bitmask_irradiance, indirect_irradiance
@@ -58,13 +57,13 @@ def screen_methods(
             "visibility bitmask": (bitmask_occlusion, surface, static),
         }
     pixels = shot.pixels
-    irradiance = evaluate_light.fill(mask, pixels.irradiance)
+    irradiance = fill(mask, pixels.irradiance)
     if isinstance(settings, Scattering):
         extinction, ior = (float(x) for x in pixels.medium)
         albedo = tuple(pixels.albedo[0].tolist())
         static = {"albedo": albedo, "extinction": extinction, "ior": ior}
         return {"screen space": (radiant_exitance, (*surface, irradiance), static)}
-    albedo = evaluate_light.fill(mask, pixels.albedo[pixels.material])
+    albedo = fill(mask, pixels.albedo[pixels.material])
     images = *surface, np.asarray(albedo * irradiance, np.float32)
     return {
         "screen space": (indirect_irradiance, images, {}),

@@ -84,9 +84,9 @@ def denoiser_inputs(
     """Noisy image and albedo, in colour; the transported light, as the networks' is."""
     mask = shot.gbuffer.mask
     if isinstance(shot, View):
-        gray = evaluate.fill(mask, values)
+        gray = evaluate.fill(mask, values, evaluate.OPEN)
         color = np.repeat(gray[..., None], 3, axis=2)
-        return color, evaluate_light.fill(mask, np.ones((len(values), 3), np.float32))
+        return color, evaluate.fill(mask, np.ones((len(values), 3), np.float32))
     albedo = shot.pixels.albedo[shot.pixels.material].astype(np.float32)
-    color = evaluate_light.fill(mask, values)
-    return color, evaluate_light.fill(mask, albedo)
+    color = evaluate.fill(mask, values)
+    return color, evaluate.fill(mask, albedo)

@@ -11,7 +11,13 @@ from jaxtyping import Array, Bool, Float, Key
 from ginn_jax.architecture import Network
 from ginn_jax.camera import Camera, orbit_camera
 from ginn_jax.dataset import ShadedPoints, count_given
-from ginn_jax.image import as_openness, encode_cloud, shade_image, shade_points
+from ginn_jax.image import (
+    Encoded,
+    as_openness,
+    encode_cloud,
+    shade_image,
+    shade_points,
+)
 from ginn_jax.limits import Limits
 from ginn_jax.mesh import Mesh
 from ginn_jax.metrics import (
@@ -34,6 +40,9 @@ from ginn_jax.reference import (
 )
 
 Row = dict[str, Any]
+Image = Float[np.ndarray, "H W *C"]
+# What a background is that nothing occludes.
+OPEN = 1.0
 
 
 class Model(NamedTuple):
@@ -87,7 +96,6 @@ def evaluate_clouds(
             {
                 "name": name,
                 "points": int(np.sum(encoded.points.mask)),
-                "raw_mse_3d": raw,
                 "noise_floor_3d": noise,
                 "mse_3d": raw - noise,
                 "variance_3d": spread,
@@ -107,7 +115,7 @@ def split_cloud(cloud: ShadedPoints) -> tuple[ShadedPoints, ShadedPoints]:
 
 def pool_rows(rows: Sequence[Row]) -> Row:
     """Means over the clouds; the relative error is a ratio of means, not their mean."""
-    names = ("raw_mse_3d", "mse_3d", "noise_floor_3d", "variance_3d", "ray_variance")
+    names = ("mse_3d", "noise_floor_3d", "variance_3d", "ray_variance")
     pooled = {name: float(np.mean([row[name] for row in rows])) for name in names}
     return pooled | {
         "clouds": len(rows),
@@ -130,7 +138,7 @@ def frame(mesh: Mesh, camera: Camera) -> View:
     scene = build_scene(mesh)
     gbuffer = render_gbuffer(scene, camera)
     nothing = np.zeros(int(gbuffer.mask.sum()), np.float32)
-    return View(scene, gbuffer, fill(gbuffer.mask, nothing), nothing)
+    return View(scene, gbuffer, fill(gbuffer.mask, nothing, OPEN), nothing)
 
 
 def traced(view: View, radius: float, rays: int, *, seed: int) -> Estimate:
@@ -142,15 +150,17 @@ def traced(view: View, radius: float, rays: int, *, seed: int) -> Estimate:
 
 def with_truth(view: View, truth: Estimate) -> View:
     """The view with a reference."""
-    reference = fill(view.gbuffer.mask, truth.mean)
+    reference = fill(view.gbuffer.mask, truth.mean, OPEN)
     return view._replace(reference=reference, variance=truth.variance)
 
 
 def fill(
-    mask: Bool[np.ndarray, "H W"], values: Float[np.ndarray, "P"]
-) -> Float[np.ndarray, "H W"]:
-    """An image of the foreground values, open (1) elsewhere."""
-    image = np.ones(mask.shape, np.float32)
+    mask: Bool[np.ndarray, "H W"],
+    values: Float[np.ndarray, "P *C"],
+    background: float = 0.0,
+) -> Float[np.ndarray, "H W *C"]:
+    """An image of the foreground values, `background` elsewhere."""
+    image = np.full((*mask.shape, *values.shape[1:]), background, np.float32)
     image[mask] = values
     return image
 
@@ -175,6 +185,26 @@ def timed(work: Callable[[], Any], repeats: int = 3) -> tuple[Any, float, float]
     return result, seconds[0], float(np.median(seconds[1:]))
 
 
+def timed_network(
+    limits: Limits,
+    encode: Callable[[Limits], tuple[Encoded, Limits]],
+    shade: Callable[[Limits, Encoded], tuple[Image, Limits]],
+) -> tuple[Encoded, Image, Limits, Row]:
+    """Codes, an image, the limits that sufficed, and the seconds of f_3D and f_2D."""
+    _, limits = encode(limits)
+    (encoded, limits), _, deep = timed(lambda: encode(limits))
+    _, limits = shade(limits, encoded)
+    (image, limits), _, flat = timed(lambda: shade(limits, encoded))
+    times = {"seconds_3d": deep, "seconds_2d": flat, "seconds": deep + flat}
+    points = int(np.sum(encoded.points.mask))
+    return encoded, image, limits, {"points": points} | times
+
+
+def at_scale(scale: float) -> str:
+    """What the name of a method says of a resolution scale."""
+    return f", scale {scale:g}" if scale < 1 else ""
+
+
 def network_row(
     network: Network,
     limits: Limits,
@@ -187,33 +217,18 @@ def network_row(
 
     `scale` is the resolution scale of `shade_image`.
     """
+    pixels = view.gbuffer.position, view.gbuffer.normal, view.gbuffer.mask
+    ends = model.variables, cloud.position, cloud.normal
+    _, image, limits, times = timed_network(
+        limits,
+        lambda limits: encode_cloud(network, limits, *ends, key=model.key),
+        lambda limits, encoded: shade_image(
+            network, limits, model.variables, encoded, *pixels, resolution_scale=scale
+        ),
+    )
     radius = network.levels[0]
-    arguments = (cloud.position, cloud.normal)
-    _, limits = encode_cloud(
-        network, limits, model.variables, *arguments, key=model.key
-    )
-    (encoded, limits), _, deep = timed(
-        lambda: encode_cloud(
-            network, limits, model.variables, *arguments, key=model.key
-        )
-    )
-    pixels = (view.gbuffer.position, view.gbuffer.normal, view.gbuffer.mask)
-
-    def shade() -> tuple[Float[np.ndarray, "H W"], Limits]:
-        arrays = model.variables, encoded, *pixels
-        return shade_image(network, limits, *arrays, resolution_scale=scale)
-
-    _, limits = shade()
-    (image, limits), _, flat = timed(shade)
-    lower = f", scale {scale:g}" if scale < 1 else ""
-    row = {
-        "method": f"network, disk {radius:g}{lower}",
-        "disk_radius": radius,
-        "points": int(np.sum(encoded.points.mask)),
-        "seconds_3d": deep,
-        "seconds_2d": flat,
-        "seconds": deep + flat,
-    }
+    method = f"network, disk {radius:g}" + at_scale(scale)
+    row = {"method": method, "disk_radius": radius} | times
     return row | image_errors(view, image), image, limits
 
 
@@ -221,7 +236,7 @@ def ray_row(view: View, radius: float, rays: int, seed: int) -> Row:
     """Error and time of ray-traced ambient occlusion at `rays` per pixel."""
     truth, _, seconds = timed(lambda: traced(view, radius, rays, seed=seed))
     row = {"method": f"{rays} rays", "rays": rays, "seconds": seconds}
-    return row | image_errors(view, fill(view.gbuffer.mask, truth.mean))
+    return row | image_errors(view, fill(view.gbuffer.mask, truth.mean, OPEN))
 
 
 def mean_rows(rows: Sequence[Row]) -> list[Row]:

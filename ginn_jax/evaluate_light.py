@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ginn_jax.architecture import Network
 from ginn_jax.camera import Camera, orbit_camera
 from ginn_jax.dataset import count_asked
-from ginn_jax.evaluate import Model, Row, timed
+from ginn_jax.evaluate import Image, Model, Row, at_scale, fill, timed, timed_network
 from ginn_jax.image import Encoded, encode_cloud, shade_image, shade_points
 from ginn_jax.irradiance import ColorEstimate
 from ginn_jax.limits import Limits
@@ -30,8 +30,6 @@ from ginn_jax.lit_scenes import (
 from ginn_jax.mesh import Samples
 from ginn_jax.metrics import (
     dssim,
-    equal_rays,
-    median_known,
     relative_error,
     tone_map,
 )
@@ -91,40 +89,35 @@ def evaluate_lit_clouds(
         values, limits = shade_points(network, limits, *ends, *numbers)
         errors = unit_errors(encoded, asked, np.maximum(values, 0.0))
         rows.append({"name": name, "points": int(np.sum(encoded.points.mask))} | errors)
-        rows[-1]["path_variance"] = rows[-1]["noise_floor_3d"] * settings.paths
+        rows[-1]["ray_variance"] = rows[-1]["noise_floor_3d"] * settings.paths
     return rows, limits
 
 
 def unit_errors(
     encoded: Encoded, asked: LitCloud, values: Float[np.ndarray, "N C"]
 ) -> Row:
-    """Errors of `values` at points, means over the channels that are lit."""
-    scale = np.asarray(encoded.scale, np.float64)
-    lit = scale > 0
-    unit = np.where(lit, scale, 1.0) ** 2
-    raw = np.mean((values.astype(np.float64) - asked.target) ** 2, axis=0) / unit
-    noise = np.mean(asked.variance, axis=0, dtype=np.float64) / unit
-    spread = np.var(asked.target, axis=0, dtype=np.float64) / unit - noise
-    lit = np.broadcast_to(lit, raw.shape)
+    """Errors of `values` at points, noise subtracted."""
+    scale = np.asarray(encoded.scale)
+    noise = np.asarray(np.mean(asked.variance, axis=0, dtype=np.float64))
+    error = np.mean((values.astype(np.float64) - asked.target) ** 2, axis=0) - noise
+    spread = np.asarray(np.var(asked.target, axis=0, dtype=np.float64) - noise)
     errors = {
-        "mse_3d": float(np.mean((raw - noise)[lit])),
-        "noise_floor_3d": float(np.mean(noise[lit])),
-        "variance_3d": float(np.mean(spread[lit])),
+        "mse_3d": in_units(error, scale),
+        "noise_floor_3d": in_units(noise, scale),
+        "variance_3d": in_units(spread, scale),
     }
     relative = relative_error(errors["mse_3d"], errors["variance_3d"])
     return errors | {"relative_mse_3d": relative}
 
 
-def pool_lit_rows(rows: Sequence[Row]) -> Row:
-    """Means over the clouds; relative errors are ratios of means."""
-    names = ("mse_3d", "noise_floor_3d", "variance_3d", "path_variance")
-    pooled = {name: float(np.mean([row[name] for row in rows])) for name in names}
-    return pooled | {
-        "clouds": len(rows),
-        "relative_mse_3d": relative_error(pooled["mse_3d"], pooled["variance_3d"]),
-        "median_relative_mse_3d": median_known([r["relative_mse_3d"] for r in rows]),
-        "equal_rays": equal_rays(pooled["mse_3d"], pooled["path_variance"]),
-    }
+def in_units(squared: Float[np.ndarray, "C"], scale: Float[np.ndarray, "K"]) -> float:
+    """Mean of squared light over the channels that are lit, in units of their light.
+
+    `scale` is the mean light of each channel, or of all where it is one number.
+    """
+    scale = np.broadcast_to(scale, squared.shape).astype(np.float64)
+    lit = scale > 0
+    return float(np.mean(squared[lit] / scale[lit] ** 2)) if lit.any() else float("nan")
 
 
 def lit_view(
@@ -163,15 +156,6 @@ def with_truth(view: LitView, truth: ColorEstimate) -> LitView:
     return view._replace(pixels=pixels)
 
 
-def fill(
-    mask: Bool[np.ndarray, "H W"], values: Float[np.ndarray, "P *C"]
-) -> Float[np.ndarray, "H W *C"]:
-    """An image of the foreground values, black elsewhere."""
-    image = np.zeros((*mask.shape, *values.shape[1:]), np.float32)
-    image[mask] = values
-    return image
-
-
 def displayed(
     view: LitView, transported: Float[np.ndarray, "P 3"]
 ) -> Float[np.ndarray, "H W 3"]:
@@ -189,15 +173,14 @@ def lit_image_errors(
     """2D errors of the foreground: of the transported light less its noise, in units of
     the mean light; DSSIM of what is displayed, tone-mapped."""
     mask, pixels = view.gbuffer.mask, view.pixels
-    unit = np.maximum(np.asarray(scale, np.float64), 1e-30) ** 2
-    raw = np.mean((values.astype(np.float64) - pixels.target) ** 2, axis=0)
-    noise = np.mean(pixels.variance, axis=0)
-    spread = np.var(pixels.target, axis=0) - noise
+    noise = np.mean(pixels.variance, axis=0, dtype=np.float64)
+    error = np.mean((values.astype(np.float64) - pixels.target) ** 2, axis=0) - noise
+    spread = np.var(pixels.target, axis=0, dtype=np.float64) - noise
     right = displayed(view, pixels.target)
     mine, right = (tone_map(i, right, mask) for i in (displayed(view, values), right))
     return {
-        "mse_2d": float(np.mean((raw - noise) / unit)),
-        "variance_2d": float(np.mean(spread / unit)),
+        "mse_2d": in_units(error, scale),
+        "variance_2d": in_units(spread, scale),
         "dssim_2d": dssim(mine, right, mask),
     }
 
@@ -211,41 +194,34 @@ def lit_network_row(
     scale: float = 1.0,
 ) -> tuple[Row, Float[np.ndarray, "P 3"], Encoded, Limits]:
     """Errors and times of the network on one object; its values and codes."""
-    _, limits = encode_lit(network, limits, model, cloud)
-    (encoded, limits), _, deep = timed(
-        lambda: encode_lit(network, limits, model, cloud)
-    )
     mask = view.gbuffer.mask
-    numbers = network_numbers(view.pixels, channels_of(encoded))
-    material, light = (np.stack([fill(mask, a) for a in number]) for number in numbers)
+    pixels = view.gbuffer.position, view.gbuffer.normal, mask
+    material, light = (
+        np.stack([fill(mask, a) for a in number])
+        for number in network_numbers(view.pixels)
+    )
 
-    def shade() -> tuple[Float[np.ndarray, "H W C"], Limits]:
-        gbuffer = view.gbuffer.position, view.gbuffer.normal, mask
+    def shade(limits: Limits, encoded: Encoded) -> tuple[Image, Limits]:
+        some = channels_of(encoded)
         return shade_image(
             network,
             limits,
             model.variables,
             encoded,
-            *gbuffer,
+            *pixels,
             background=0.0,
             resolution_scale=scale,
-            material=material,
-            light=light,
+            material=material[some],
+            light=light[some],
         )
 
-    _, limits = shade()
-    (image, limits), _, flat = timed(shade)
+    encoded, image, limits, times = timed_network(
+        limits, lambda limits: encode_lit(network, limits, model, cloud), shade
+    )
     values = np.broadcast_to(image[mask], view.pixels.target.shape)
-    lower = f", scale {scale:g}" if scale < 1 else ""
-    row = {
-        "method": f"network{lower}",
-        "points": int(np.sum(encoded.points.mask)),
-        "seconds_3d": deep,
-        "seconds_2d": flat,
-        "seconds": deep + flat,
-    }
-    units = np.asarray(encoded.scale)
-    return row | lit_image_errors(view, values, units), values, encoded, limits
+    row = {"method": "network" + at_scale(scale)} | times
+    errors = lit_image_errors(view, values, np.asarray(encoded.scale))
+    return row | errors, values, encoded, limits
 
 
 def path_row(

@@ -13,7 +13,7 @@ from rich.console import Console
 from ginn_jax import evaluate_light, fit, report
 from ginn_jax.architecture import Network
 from ginn_jax.dataset import count_asked, count_given
-from ginn_jax.evaluate import Model, mean_rows
+from ginn_jax.evaluate import Model, fill, mean_rows, pool_rows
 from ginn_jax.experiment import (
     Clock,
     RunOptions,
@@ -188,7 +188,7 @@ def evaluation(
         rows, limits = evaluate_light.evaluate_lit_clouds(
             config.network, limits, model, clouds[name], names, settings
         )
-        pooled = evaluate_light.pool_lit_rows(rows)
+        pooled = pool_rows(rows)
         metrics |= {f"unseen {name}": pooled, f"unseen {name}, each": rows}
     firsts = (list(zip(unseen[n], clouds[n], strict=True))[:2] for n in unseen)
     shown = [pair for pairs in firsts for pair in pairs][:6]
@@ -245,5 +245,5 @@ def panels(view: evaluate_light.LitView, values: np.ndarray) -> list[np.ndarray]
     """Displayed reference and prediction, then the transported light of both alone."""
     target, mask = view.pixels.target, view.gbuffer.mask
     whole = (evaluate_light.displayed(view, light) for light in (target, values))
-    alone = (evaluate_light.fill(mask, light) for light in (target, values))
+    alone = (fill(mask, light) for light in (target, values))
     return [*whole, *alone]

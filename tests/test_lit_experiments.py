@@ -134,6 +134,10 @@ def test_unlit_channels_have_no_say():
     encoded = Encoded(None, None, None, None, light.mean(axis=0))  # type: ignore
     found = evaluate_light.unit_errors(encoded, cloud_of(light), 0.5 * light)
     assert np.isfinite(list(found.values())).all()
+    squared, scale = np.array([4.0, 9.0, 0.0]), np.array([2.0, 3.0, 0.0])
+    assert evaluate_light.in_units(squared, scale) == 1.0
+    assert evaluate_light.in_units(np.array([4.0, 8.0, 0.0]), np.array([2.0])) == 1.0
+    assert np.isnan(evaluate_light.in_units(squared, np.zeros(3)))
 
 
 def test_grey_light_on_grey_things_is_one_channel():
