@@ -23,7 +23,7 @@ from ginn_jax.dataset import ShadedPoints, batch_order, stack_clouds
 from ginn_jax.errors import InputError
 from ginn_jax.files import writing
 from ginn_jax.geometry import uniform_limits
-from ginn_jax.limits import Limits, exceeded, measure_limits, raise_limits
+from ginn_jax.limits import Limits, exceeded, measure_limits, widened
 from ginn_jax.lit_clouds import Cloud, channel_of
 from ginn_jax.train import (
     Training,
@@ -31,6 +31,7 @@ from ginn_jax.train import (
     batch_mesh,
     init_state,
     probe_step,
+    share_key,
     train_step,
 )
 
@@ -104,14 +105,17 @@ def fit(
             config, limits, state, step_batch(config, clouds, step)
         )
         loss = float(report.loss)
+        if short := exceeded(limits, jax.device_get(report.demands)):
+            measured = batch_limits(config, clouds, step)
+            wider = widened(limits, measured, short)
+            more = {n: size for n, size in wider.sizes if size > limits.of(n)}
+            progress(step, loss, f"raised {', '.join(more)}")
+            limits, raised = wider, raised | more
+            seconds["compile"] += time.perf_counter() - begin
+            continue
         purpose = "train" if compiled_for == limits else "compile"
         seconds[purpose] += time.perf_counter() - begin
         compiled_for = limits
-        if short := exceeded(limits, jax.device_get(report.demands)):
-            limits = raise_limits(limits, short, RAISE_SLACK)
-            raised |= short
-            progress(step, loss, f"raised {', '.join(short)}")
-            continue
         history.append(loss)
         if (step + 1) % schedule.report == 0:
             progress(step + 1, recent_loss(history, schedule.report), "")
@@ -144,6 +148,21 @@ def training_limits(config: Training, clouds: Sequence[Cloud]) -> Limits:
 
     generous = uniform_limits(config.network, 16 * share * config.points)
     return measure_limits(generous, probe, probes, PROBE_SLACK)
+
+
+def batch_limits(config: Training, clouds: Sequence[Cloud], step: int) -> Limits:
+    """Capacities that hold the batch of a step, with slack."""
+    batch = step_batch(config, clouds, step)
+    devices = batch_mesh(config.batch_size).size
+    size = config.batch_size // devices
+
+    def probe(limits: Limits, i: int) -> dict[str, Any]:
+        share = jax.tree.map(lambda a: a[i * size : (i + 1) * size], batch)
+        key = share_key(config, step, i)
+        return jax.device_get(probe_step(config, limits, share, key=key))
+
+    ample = uniform_limits(config.network, 16 * size * config.points)
+    return measure_limits(ample, probe, devices, RAISE_SLACK)
 
 
 def save_losses(folder: Path, history: Sequence[float]) -> None:

@@ -5,7 +5,7 @@ host-level: they hold no more than a block of queries at a time, and where a cap
 too small they raise it and try again; the limits that sufficed come back for reuse.
 """
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
@@ -17,12 +17,26 @@ from ginn_jax.architecture import Network
 from ginn_jax.checks import LARGEST, number, real_array, unit_rows
 from ginn_jax.dataset import center_of, relative_to
 from ginn_jax.errors import InputError
-from ginn_jax.limits import Demands, Limits, say_raised, with_room
+from ginn_jax.geometry import uniform_limits
+from ginn_jax.limits import (
+    SLACK,
+    Demands,
+    Limits,
+    measure_limits,
+    say_raised,
+    with_room,
+)
 from ginn_jax.neighbors import bucket, pad_rows
 from ginn_jax.network import Variables
 from ginn_jax.process import ALONE
 from ginn_jax.receptive_field import Oriented
-from ginn_jax.shading import Encoded, encode, numbers_asked, shade
+from ginn_jax.shading import (
+    Encoded,
+    cloud_demands,
+    encode,
+    numbers_asked,
+    shade,
+)
 from ginn_jax.upsample import Surface, sample_pixels, upsample
 from ginn_jax.voxels import morton_code
 
@@ -32,6 +46,7 @@ encode_whole = jax.jit(encode, static_argnums=(0, 1))
 shade_block = jax.jit(
     shade, static_argnums=(0, 1), static_argnames="coherent", compiler_options=ALONE
 )
+_cloud_demands = jax.jit(cloud_demands, static_argnums=(0, 1))
 _upsample = jax.jit(upsample)
 _coarse_cells = jax.jit(lambda *points: morton_code(*points, bits=5).astype(jnp.uint16))
 
@@ -70,9 +85,21 @@ def encode_cloud(
         made, demands = encode_whole(network, deep, variables, cloud, *more, key)
         return made, [demands]
 
-    encoded, sufficed = with_room(limits, attempt)
+    measure = partial(cloud_limits, network, cloud, key=key)
+    encoded, sufficed = with_room(limits, attempt, measure)
     say_raised(limits, sufficed)
     return encoded._replace(center=center), sufficed
+
+
+def cloud_limits(network: Network, cloud: Oriented, *, key: Key[Array, ""]) -> Limits:
+    """Limits that hold what f_3D of a cloud needs, measured with ample ones."""
+    ample = uniform_limits(network, 16 * cloud.mask.shape[0])
+
+    def probe(limits: Limits, _: int) -> Demands:
+        deep = without(limits, network.query.name)
+        return jax.device_get(_cloud_demands(network, deep, cloud, key))
+
+    return measure_limits(ample, probe, 1, SLACK)
 
 
 def check_numbers(name: str, numbers: Any, width: int, rows: int) -> None:

@@ -58,14 +58,31 @@ def most_exceeded(limits: Limits, demands: Sequence[Demands]) -> dict[str, int]:
 
 
 def with_room(
-    limits: Limits, attempt: Callable[[Limits], tuple[Made, Sequence[Demands]]]
+    limits: Limits,
+    attempt: Callable[[Limits], tuple[Made, Sequence[Demands]]],
+    measure: Callable[[], Limits] | None = None,
 ) -> tuple[Made, Limits]:
-    """Host: what `attempt` makes in limits that suffice for its demands, and those."""
+    """Host: what `attempt` makes in limits that suffice for its demands, and those.
+
+    Where several searches build on each other, what the later ones say they need means
+    little once an earlier one lacked room: a Poisson disk that misses edges keeps too
+    many points. `measure` finds limits by what all of them truly need.
+    """
     while True:
         made, demands = attempt(limits)
         if not (short := most_exceeded(limits, jax.device_get(demands))):
             return made, limits
-        limits = raise_limits(limits, short, SLACK)
+        measured = limits if measure is None else measure()
+        limits = widened(limits, measured, short)
+
+
+def widened(limits: Limits, measured: Limits, short: dict[str, int]) -> Limits:
+    """Limits as large as both; where that is nothing new, raised by what was short."""
+    sizes = dict(measured.sizes)
+    wider = tuple((n, max(size, sizes.get(n, 0))) for n, size in limits.sizes)
+    if wider == limits.sizes:
+        return raise_limits(limits, short, SLACK)
+    return Limits(wider)
 
 
 def say_raised(given: Limits, found: Limits) -> None:

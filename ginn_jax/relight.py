@@ -4,6 +4,7 @@ Of a scene that does not move, hierarchy, neighbours and the values of all kerne
 for another light only features are gathered, weighted and added up anew.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +15,7 @@ from ginn_jax.architecture import Network
 from ginn_jax.checks import unit_rows
 from ginn_jax.dataset import center_of, relative_to
 from ginn_jax.geometry import Geometry, build_geometry, build_query_field
-from ginn_jax.image import block_size, only, pad_channels, without
+from ginn_jax.image import block_size, cloud_limits, only, pad_channels, without
 from ginn_jax.limits import Demands, Limits, say_raised, with_room
 from ginn_jax.lit_clouds import LitCloud, network_numbers
 from ginn_jax.mcconv import stored_kernel
@@ -147,7 +148,8 @@ def prepare_relighting(
         plan, demands = _plan_scene(network, deep, variables, points, key)
         return plan, [demands]
 
-    scene, sufficed = with_room(limits, plan_points)
+    measure = partial(cloud_limits, network, points, key=key)
+    scene, sufficed = with_room(limits, plan_points, measure)
 
     def plan_blocks(limits: Limits) -> tuple[list[QueryPlan], list[Demands]]:
         flat = only(limits, network.query.name)

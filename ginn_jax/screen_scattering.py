@@ -47,7 +47,7 @@ def radiant_exitance(
     irradiance: Float[Any, "H W 3"],
     camera: Camera,
     *,
-    albedo: Float[Any, "3"],
+    albedo: Float[Any, "3"] | tuple[float, float, float],
     extinction: float,
     ior: float,
     taps: int = 25,
@@ -68,8 +68,8 @@ def radiant_exitance(
     """
     check_counts(taps=taps)
     check_above_zero(extinction=extinction, widening=widening)
-    if jnp.shape(albedo) != (3,):
-        raise InputError(f"albedo {jnp.shape(albedo)} must be three numbers")
+    if np.shape(albedo) != (3,):
+        raise InputError(f"albedo {np.shape(albedo)} must be three numbers")
     if not ior >= 1:
         raise InputError(f"ior {ior} must be at least 1")
     screen = enter_screen(position, normal, mask, camera)

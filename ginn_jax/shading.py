@@ -56,6 +56,14 @@ def encode(
     return Encoded(*ends, code, scale), demands
 
 
+def cloud_demands(
+    network: Network, limits: Limits, cloud: Oriented, key: Key[Array, ""]
+) -> Demands:
+    """What `encode` needs of every capacity, without f_3D itself."""
+    cloud, order = in_coherent_order(cloud)
+    return build_geometry(network, limits, cloud, order, key=key)[1]
+
+
 def encode_channels(
     network: Network,
     variables: Variables,

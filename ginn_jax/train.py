@@ -274,6 +274,12 @@ def probe_step(
     return _probe(config, limits, share, key)
 
 
+def share_key(config: Training, step: int, device: int) -> Key[Array, ""]:
+    """The randomness of one device's share of the batch of a step."""
+    key = jax.random.fold_in(jax.random.key(config.seed), step)
+    return jax.random.fold_in(key, device)
+
+
 @partial(jax.jit, static_argnums=(0, 1))
 def _probe(config: Training, limits: Limits, share: ShadedPoints, key: Any) -> Demands:
     return make_example(config, limits, share, key=key)[1]

@@ -1,7 +1,9 @@
 """Comparisons: fronts and lost cells by definition, methods on the same pixels."""
 
 import json
+import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -84,10 +86,10 @@ pytestmark = pytest.mark.usefixtures("cheap_compiling")
 LEARNED = {"data": {"radius": 0.1}}
 
 
-def finished_run(folder):
+def finished_run(folder, network=tiny.ONE_LEVEL):
     """A folder as a training run leaves it, of the tiny untrained network."""
     folder.mkdir()
-    config = replace(tiny.CONFIG, network=tiny.ONE_LEVEL)
+    config = replace(tiny.CONFIG, network=network)
     checkpoint.save_run(folder, config, tiny.ONE_LEVEL_LIMITS, LEARNED)
     manager = checkpoint.open_manager(folder, fresh=True)
     checkpoint.save_state(manager, tiny.fresh_state(config, tiny.ONE_LEVEL_LIMITS))
@@ -95,11 +97,62 @@ def finished_run(folder):
     return folder
 
 
-def test_comparison_ends_in_a_report_and_keeps_its_references(tmp_path, monkeypatch):
+@pytest.fixture
+def small_blocks(monkeypatch):
     monkeypatch.setattr(scenes, "ProcessPoolExecutor", tiny.Here)
     # Every picture has full blocks, so one shape is compiled.
     for module in (image, compare_networks):
         monkeypatch.setattr(module, "BLOCK", 128)
+
+
+LIT = replace(tiny.ONE_LEVEL, lights=1, materials=1)
+SCATTERING = replace(LIT, materials=3, asks="all", local=True)
+
+
+@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.parametrize(("effect", "network"), [("gi", LIT), ("sss", SCATTERING)])
+def test_light_is_compared_with_tracing_plain_and_denoised(
+    effect, network, tmp_path, monkeypatch
+):
+    """By a denoiser that leaves the image as it is."""
+    asked = []
+
+    def denoise(color, albedo, normal, hdr, clean_aux):
+        asked.append((color.shape, albedo.shape, normal.shape, hdr, clean_aux))
+        return color
+
+    monkeypatch.setitem(sys.modules, "mitsuba_oidn", SimpleNamespace(denoise=denoise))
+    ours = finished_run(tmp_path / "ours", network)
+    splats = finished_run(tmp_path / "splats", replace(network, splat=True))
+    options = experiment.Options(
+        effect,
+        out=tmp_path / "out",
+        checkpoint=ours,
+        only_2d=ours,
+        only_3d=splats,
+        objects=1,
+        views=1,
+        resolution=40,
+        reference=8,
+        counts=(2,),
+        disks=(0.75,),
+        points=1500,
+    )
+    found = experiment.main(options)
+    rows = {row["method"]: row for row in found["error_against_time"]}
+    assert {"ours, disk 0.06", "ours, scale 0.5", "3D only"} <= set(rows)
+    plain, denoised = rows["2 paths"], rows["2 paths, denoised"]
+    assert denoised["mse_2d"] == pytest.approx(plain["mse_2d"], rel=1e-5)
+    assert denoised["seconds"] > plain["seconds"]
+    assert asked[0] == (*[(40, 40, 3)] * 3, True, True)
+    results = {row["method"]: row for row in found["results"]}
+    for name in (OURS, "2D only", "3D only"):
+        assert results[name]["relative_mse_3d"] > 0
+    assert results[OURS]["mse_3d"] == results["2D only"]["mse_3d"]
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_comparison_ends_in_a_report_and_keeps_its_references(tmp_path):
     run = finished_run(tmp_path / "run")
     options = experiment.Options(
         "ao",
