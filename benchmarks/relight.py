@@ -82,7 +82,7 @@ def lit_pair(options: Options, network: Network) -> tuple[LitCloud, LitCloud]:
     scene = reference.build_scene(objects.load_object(source, ground=not scatters))
     size = options.resolution
     seen = reference.render_gbuffer(scene, orbit_camera(width=size, height=size))
-    cloud = lit_scenes.visible_samples(scene, options.points, seed=0)
+    cloud = lit_scenes.visible_samples(scene, options.points, 0, not scatters)
     pixels = Samples(
         *(a[seen.mask] for a in (seen.position, seen.normal, seen.material))
     )

@@ -79,7 +79,8 @@ def main(options: Options) -> dict[str, Any]:
     light = choose_light(options)
     key = jax.random.key(options.seed)
     networks = load_networks(options.effect, settings, (None,) * 3, key=key)
-    carried = sequences.carried_samples(meshes[0], options.points, seed=options.seed)
+    given = meshes[0], options.points, options.effect != "sss"
+    carried = sequences.carried_samples(*given, seed=options.seed)
     frames: dict[str, list[np.ndarray]] = {}
     with bar(console) as progress:
         task = progress.add_task("frames", total=len(meshes), note="")

@@ -80,11 +80,13 @@ def main(options: Options) -> dict[str, Any]:
     settings = compare.effect_settings(options.effect, *counts)
     assert not isinstance(settings, compare.Occlusion)
     unseen = UNSEEN_SEED + options.seed
+    scatters = isinstance(settings, Scattering)
     mesh = fit_unit_box(
-        load_mesh(options.mesh) if options.mesh else random_shape(unseen)
+        load_mesh(options.mesh) if options.mesh else random_shape(unseen, scatters)
     )
-    mesh = mesh if isinstance(settings, Scattering) else add_ground(mesh)
-    samples = visible_samples(build_scene(mesh), options.points, options.seed)
+    mesh = mesh if scatters else add_ground(mesh)
+    scene = build_scene(mesh)
+    samples = visible_samples(scene, options.points, options.seed, not scatters)
     config, limits, weights = load_pretrained(options.effect)
     camera = orbit_camera(width=options.resolution, height=options.resolution)
     ready: Relightable | None = None

@@ -63,7 +63,9 @@ def main(options: Options) -> Path:
     require(options, {"channels": 1, "resolution": 32, "points": 1000, "seed": 0})
     unseen = UNSEEN_SEED + options.seed
     mesh = fit_unit_box(
-        load_mesh(options.mesh) if options.mesh else random_shape(unseen)
+        load_mesh(options.mesh)
+        if options.mesh
+        else random_shape(unseen, options.effect == "sss")
     )
     mesh = mesh if options.effect == "sss" else add_ground(mesh)
     position, code = latent_code(options, mesh)
@@ -89,7 +91,9 @@ def latent_code(
 ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N K"]]:
     """Finest points and what f_3D says of them; of the first colour if there are."""
     config, limits, weights = load_pretrained(options.effect)
-    samples = visible_samples(build_scene(mesh), options.points, options.seed)
+    sheets = options.effect != "sss"
+    scene = build_scene(mesh)
+    samples = visible_samples(scene, options.points, options.seed, sheets)
     settings = compare.effect_settings(options.effect, options.points, 2, 0.1)
     numbers: tuple[Any, ...] = ()
     if not isinstance(settings, Occlusion):

@@ -159,13 +159,19 @@ def lit_cloud(source: Source, settings: Illumination | Scattering) -> LitCloud:
 
 def sample_lit(lit: Lit, settings: Illumination | Scattering, *, seed: int) -> LitCloud:
     """Uniform samples of a scene, the light on them, and what transport makes of it."""
-    samples = visible_samples(build_scene(lit.scene.mesh), settings.points, seed)
+    samples = lit_samples(lit, settings.points, seed)
     cloud = lit_points(lit, samples, settings.looks, seed=seed)
     asked = slice(-(settings.targets or len(cloud.position)), None)
     ends = cloud.position[asked], cloud.normal[asked]
     truth = transport(lit, *ends, paths=settings.paths, seed=seed)
     cloud.target[asked], cloud.variance[asked] = truth
     return cloud
+
+
+def lit_samples(lit: Lit, count: int, seed: int) -> Samples:
+    """Visible samples of a lit scene; of the outside alone of what holds a medium."""
+    scene = build_scene(lit.scene.mesh)
+    return visible_samples(scene, count, seed, both_sides=lit.medium.size == 0)
 
 
 def lit_points(lit: Lit, samples: Samples, looks: int, *, seed: int) -> LitCloud:
@@ -178,21 +184,23 @@ def lit_points(lit: Lit, samples: Samples, looks: int, *, seed: int) -> LitCloud
     return LitCloud(position, normal, material, *light, lit.albedo, lit.medium)
 
 
-def visible_samples(scene: Scene, count: int, seed: int) -> Samples:
+def visible_samples(
+    scene: Scene, count: int, seed: int, both_sides: bool = True
+) -> Samples:
     """Uniform samples of the surface that light can reach, on both its sides.
 
     Meshes of many parts hide surface inside other parts, where no camera can be; it
     would only take points away from what is seen. A sample is dropped if none of
     `PROBE_RAYS` rays from it leaves the scene. So the inside of what is closed is
     dropped, and a sheet without thickness has samples with normals to either side, as
-    a camera sees it. The ground has one side.
+    a camera sees it; unless `both_sides` is off. The ground has one side.
 
     Raises:
         InputError: a scene that is almost all sealed off.
     """
     drawn = 5 * count // 2
     for _ in range(5):
-        samples = sample_sides(scene.mesh, drawn, seed)
+        samples = sample_sides(scene.mesh, drawn, seed, both_sides)
         seen = reached_by_light(scene, samples, seed)
         if len(seen) >= count:
             return Samples(*(a[seen[:count]] for a in samples))
@@ -200,9 +208,12 @@ def visible_samples(scene: Scene, count: int, seed: int) -> Samples:
     raise InputError("nearly all of the mesh's surface is sealed inside it: mend it")
 
 
-def sample_sides(mesh: Mesh, count: int, seed: int) -> Samples:
+def sample_sides(mesh: Mesh, count: int, seed: int, both_sides: bool) -> Samples:
     """At most `count` uniform samples; the normals of the object's to either side."""
-    position, normal, material = sample_surface(mesh, count, seed=seed)
+    samples = sample_surface(mesh, count, seed=seed)
+    if not both_sides:
+        return samples
+    position, normal, material = samples
     behind = np.random.default_rng((seed, 7)).random(count) < 0.5
     normal = np.where(behind[:, None], -normal, normal)
     kept = ~behind | (material == OBJECT)

@@ -99,16 +99,19 @@ def frames_of(animation: Animation, count: int, ground: bool) -> list[Mesh]:
     ]
 
 
-def carried_samples(mesh: Mesh, count: int, *, seed: int) -> Carried:
+def carried_samples(
+    mesh: Mesh, count: int, both_sides: bool = True, *, seed: int
+) -> Carried:
     """Uniform samples of a frame that light can reach, to be carried to the others.
 
-    On both sides of the object's faces and above the ground, as `visible_samples` are.
+    On both sides of the object's faces, unless `both_sides` is off, and above the
+    ground, as `visible_samples` are.
     """
     shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     drawn = 5 * count
     place, face = trimesh.sample.sample_surface(shape, drawn, seed=seed)[:2]
     behind = np.random.default_rng((seed, 8)).random(drawn) < 0.5
-    kept = ~behind | (mesh.material[face] == OBJECT)
+    kept = ~behind | (both_sides & (mesh.material[face] == OBJECT))
     place, face, behind = place[kept], face[kept], behind[kept]
     corners = mesh.vertices[mesh.faces[face]]
     barycentric = trimesh.triangles.points_to_barycentric(corners, place)

@@ -205,6 +205,8 @@ def test_a_sheet_is_sampled_from_both_sides_and_the_ground_from_above():
     np.testing.assert_allclose(samples.normal[ground], [[0, 1, 0]] * ground.sum())
     front = samples.normal[~ground, 2] > 0
     assert 0.4 < front.mean() < 0.6
+    one = lit_scenes.visible_samples(scene, 2000, seed=1, both_sides=False)
+    assert (one.normal[one.material == 0, 2] > 0.5).all()
     # As dense as the ground: a side has 1 of area, the ground 1.6 squared.
     assert ground.mean() == pytest.approx(2.56 / 4.56, abs=0.05)
 
