@@ -86,6 +86,8 @@ class Options:
     """Poisson disk radii at which our network runs beside its own, as times that."""
     points: int = 32_000
     """Samples per object; a fifth of them measure, the others are given."""
+    looks: int = 512
+    """Directions of the direct light per sample and pixel: what all are given."""
     radius: float = 0.1
     """Occlusion radius."""
     seed: int = 0
@@ -101,7 +103,7 @@ QUICK |= {"counts": (1, 4), "disks": ()}
 def main(options: Options) -> dict[str, Any]:
     """Run the comparison; returns what metrics.json holds."""
     least = {"objects": 1, "views": 1, "resolution": 32, "reference": 2, "seed": 0}
-    require(options, least | {"points": 1000})
+    require(options, least | {"points": 1000, "looks": 1})
     console = Console()
     targets = 64 if options.quick else TARGET_PATHS
     given = options.effect, options.points, targets, options.radius
@@ -111,7 +113,8 @@ def main(options: Options) -> dict[str, Any]:
     key = jax.random.key(options.seed)
     networks = load_networks(options.effect, settings, runs, key=key)
     if not isinstance(settings, Occlusion):
-        settings = replace(settings, targets=count_asked(options.points))
+        targets = count_asked(options.points)
+        settings = replace(settings, looks=options.looks, targets=targets)
     clouds = make(console, "clouds", sources, settings, options.out / "clouds")
     at_points, networks = errors_at_points(networks, clouds, sources, settings)
     rows, front_rows, shown = [], [], []

@@ -228,10 +228,12 @@ PRESETS = {"default": DEFAULT, "paper": PAPER, "released": RELEASED}
 PRESETS |= with_ablations(DEFAULT)
 
 # Light goes further than occlusion, hence a level more.
-_FAR = {"k": 16, "lights": 1, "sided": True}
+_FAR = {"k": 16, "lights": 1}
 _DIFFUSE = compact_network(levels=(0.02, 0.05, 0.1, 0.2), materials=1, **_FAR)
 # Most media are dense: light leaves them near to where it entered.
-_DENSE = compact_network(levels=(0.015, 0.04, 0.1, 0.2), query_radius=0.0275, **_FAR)
+_DENSE = compact_network(
+    levels=(0.015, 0.04, 0.1, 0.2), query_radius=0.0275, sided=True, **_FAR
+)
 
 
 def for_light(network: Network) -> dict[str, Network]:
