@@ -5,6 +5,7 @@ import json
 import platform
 import resource
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,11 @@ import jax
 import matplotlib
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
 
 from ginn_jax.files import writing
 from ginn_jax.metrics import tone_map
@@ -144,24 +149,47 @@ def draw_error_against_time(
 ) -> None:
     """2D error against time, log-log: one line a group, one labelled dot a method."""
     figure = Figure(figsize=(6.5, 4.5), layout="constrained")
-    axes = figure.add_subplot()
+    axes, dots = figure.add_subplot(), list[tuple[str, float, float]]()
     for name, rows in groups.items():
         ordered = sorted(rows, key=lambda row: row["seconds"])
         seconds = [1e3 * row["seconds"] for row in ordered]
         errors = [max(row["mse_2d"], 1e-7) for row in ordered]
         axes.plot(seconds, errors, "o-", label=name)
-        for i, (row, x, y) in enumerate(zip(ordered, seconds, errors, strict=True)):
-            side = 1 if i % 2 == 0 else -1  # neighbours' labels keep clear
-            axes.annotate(
-                row["method"],
-                (x, y),
-                fontsize=7,
-                xytext=(4 * side, 4 * side),
-                textcoords="offset points",
-                ha="left" if side > 0 else "right",
-                va="bottom" if side > 0 else "top",
-            )
+        names = [row["method"] for row in ordered]
+        dots += zip(names, seconds, errors, strict=True)
     axes.set(xlabel="ms per image", ylabel="2D MSE", xscale="log", yscale="log")
     axes.grid(alpha=0.3)
     figure.legend(loc="outside upper center", ncols=3, fontsize=8)
+    label_dots(axes, dots)
     figure.savefig(path, dpi=140)
+
+
+def label_dots(axes: Axes, dots: Sequence[tuple[str, float, float]]) -> None:
+    """Name every dot beside it, or further off on a line, clear of all others."""
+    figure: Any = axes.figure
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    figure.draw_without_rendering()  # places are known once the layout is
+    ends = axes.transData.transform([dot[1:] for dot in dots])
+    taken = [Bbox.from_bounds(x - 4, y - 4, 8, 8) for x, y in ends]
+    for number, (name, x, y) in enumerate(dots):
+        box, others = taken[number], taken[:number] + taken[number + 1 :]
+        for reach, angle in product((6, 14, 22, 32, 46), range(20, 380, 20)):
+            away = reach * np.cos(np.radians(angle)), reach * np.sin(np.radians(angle))
+            label = axes.annotate(
+                name,
+                (x, y),
+                fontsize=7,
+                xytext=away,
+                textcoords="offset points",
+                ha="left" if away[0] > 0 else "right",
+                va="center",
+                arrowprops={"arrowstyle": "-", "lw": 0.4} if reach > 6 else None,
+            )
+            label.set_in_layout(False)
+            label.update_positions(renderer)
+            box = Text.get_window_extent(label, renderer)
+            inside = axes.bbox.x0 < box.x0 and box.x1 < axes.bbox.x1
+            if inside and not box.count_overlaps(others):
+                break
+            label.remove()
+        taken.append(box)
