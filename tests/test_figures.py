@@ -37,7 +37,7 @@ def tiny_networks(monkeypatch):
         )
 
 
-@pytest.mark.parametrize("effect", ["ao", "gi", "sss"])
+@pytest.mark.parametrize("effect", ["ao", "sss"])
 def test_animation_tells_the_flicker_of_every_method(tmp_path, effect):
     options = animation.Options(
         effect, out=tmp_path, frames=3, resolution=40, reference=16, points=1500
