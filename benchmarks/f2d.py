@@ -20,16 +20,17 @@ import numpy as np
 
 from benchmarks.straightforward import shade_plainly
 from benchmarks.timing import Timing, circumstances, describe, measure
-from ginn_jax import image, lit_scenes, objects, reference, report
-from ginn_jax.architecture import Network, compact_network
+from ginn_jax import image, inference, lit_scenes, objects, reference, report
+from ginn_jax.architecture import Network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
-from ginn_jax.geometry import uniform_limits
 from ginn_jax.limits import Limits
 from ginn_jax.mesh import find_meshes
 from ginn_jax.network import Variables
+from ginn_jax.presets import compact_network
 from ginn_jax.receptive_field import Oriented
 from ginn_jax.reference import GBuffer, Scene
+from ginn_jax.searches import uniform_limits
 from ginn_jax.train import Training, init_state
 
 UNSEEN_SEED = 20_000_000
@@ -114,7 +115,7 @@ def compare(
     key = jax.random.key(0)
     # They have to be raised, so they end up close to the need.
     limits = uniform_limits(network, 1 << 12)
-    encoded, limits = image.encode_cloud(
+    encoded, limits = inference.encode_cloud(
         network, limits, variables, cloud.position, cloud.normal, key=key
     )
     pixels = gbuffer.position, gbuffer.normal, gbuffer.mask
@@ -159,12 +160,12 @@ def block_memory(
     network: Network, limits: Limits, variables: Variables, encoded: image.Encoded
 ) -> int:
     """Scratch memory of one block of f_2D, the same for every image, in bytes."""
-    rows = image.BLOCK
+    rows = inference.BLOCK
     zeros = np.zeros((rows, 3), np.float32)
     queries = Oriented(zeros, zeros, np.ones(rows, bool))
-    flat = image.only(limits, network.query.name)
+    flat = inference.only(limits, network.query.name)
     arrays = network, flat, variables, encoded, queries
-    lowered = image.shade_block.lower(*arrays, coherent=True)
+    lowered = inference.shade_block.lower(*arrays, coherent=True)
     memory = lowered.compile().memory_analysis()
     return int(memory.temp_size_in_bytes) if memory else 0
 

@@ -21,8 +21,8 @@ from benchmarks.timing import Timing, circumstances, describe, measure
 from ginn_jax import objects, report
 from ginn_jax.commandline import require, start
 from ginn_jax.errors import InputError
-from ginn_jax.mesh import sample_surface
 from ginn_jax.neighbors import find_neighbors
+from ginn_jax.samples import sample_surface
 
 OURS = "ginn_jax"
 

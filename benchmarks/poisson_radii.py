@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.poisson_report import PAPER, draw, write_report
 from benchmarks.timing import circumstances, measure
-from ginn_jax import architecture, lit_scenes, objects, report, scenes
+from ginn_jax import lit_scenes, objects, presets, report, scenes
 from ginn_jax.architecture import Network
 from ginn_jax.checkpoint import RECORD, damaged, load_weights, read_record
 from ginn_jax.commandline import require, start
@@ -27,21 +27,18 @@ from ginn_jax.dataset import ShadedPoints
 from ginn_jax.disk_radius import with_disk_radius
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import View, image_errors, reference_view
-from ginn_jax.geometry import build_geometry, build_query_field, limit_names
-from ginn_jax.image import (
-    BLOCK,
-    as_openness,
-    encode_cloud,
-    shade_image,
-    shade_points,
-)
+from ginn_jax.geometry import build_geometry, build_query_field
+from ginn_jax.image import as_openness, shade_image
+from ginn_jax.inference import BLOCK, encode_cloud, shade_points
 from ginn_jax.limits import Demands, Limits, measure_limits
-from ginn_jax.mesh import Samples, find_meshes
+from ginn_jax.mesh import find_meshes
 from ginn_jax.metrics import true_mse
 from ginn_jax.neighbors import bucket, pad_rows
 from ginn_jax.network import Variables
 from ginn_jax.receptive_field import Oriented, in_coherent_order
 from ginn_jax.reference import build_scene
+from ginn_jax.samples import Samples
+from ginn_jax.searches import limit_names
 from ginn_jax.train import Training, init_state
 
 UNSEEN_SEED = 20_000_000
@@ -102,7 +99,7 @@ class Subject(NamedTuple):
 def load_model(folder: Path | None) -> Model:
     """The weights of a finished run, or untrained ones of the default network."""
     if folder is None:
-        network = architecture.DEFAULT
+        network = presets.DEFAULT
         config = Training(network, steps=1, batch_size=1, points=64, queries=64)
         state = init_state(config)
         return Model(network, state.variables, scenes.Occlusion.radius)

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from benchmarks.timing import Timing, circumstances, describe, measure
-from ginn_jax import architecture, image, lit_scenes, objects, reference, report
+from ginn_jax import inference, lit_scenes, objects, presets, reference, report
 from ginn_jax.architecture import Network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.checkpoint import load_weights
@@ -24,11 +24,11 @@ from ginn_jax.commandline import require, start
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model
 from ginn_jax.evaluate_light import encode_lit
-from ginn_jax.geometry import uniform_limits
 from ginn_jax.limits import Limits
 from ginn_jax.lit_clouds import LitCloud, network_numbers
-from ginn_jax.mesh import Samples
 from ginn_jax.relight import prepare_relighting, relight
+from ginn_jax.samples import Samples
+from ginn_jax.searches import uniform_limits
 from ginn_jax.train import Training, init_state
 
 UNSEEN_SEED = 20_000_000
@@ -68,8 +68,8 @@ QUICK = {
 NETWORKS = {
     f"{effect}, {kind}": table[kind]
     for effect, table in (
-        ("illumination", architecture.ILLUMINATION),
-        ("scattering", architecture.SCATTERING),
+        ("illumination", presets.ILLUMINATION),
+        ("scattering", presets.SCATTERING),
     )
     for kind in ("homogeneous", "linear")
 }
@@ -145,7 +145,7 @@ def from_scratch(
         channels = 3 if encoded.scale is None else encoded.scale.size
         material, lit = (a[:channels] for a in network_numbers(pixels))
         ends = model.variables, encoded, pixels.position, pixels.normal
-        return image.shade_points(network, limits, *ends, material, lit)
+        return inference.shade_points(network, limits, *ends, material, lit)
 
     limits = shade(limits)[1]
     return lambda: shade(limits)[0], limits

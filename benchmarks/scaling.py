@@ -19,12 +19,13 @@ from matplotlib.figure import Figure
 
 from benchmarks.f2d import UNSEEN_SEED, block_memory
 from benchmarks.timing import Timing, circumstances, describe, measure
-from ginn_jax import image, lit_scenes, objects, reference, report
-from ginn_jax.architecture import Network, compact_network
+from ginn_jax import image, inference, lit_scenes, objects, reference, report
+from ginn_jax.architecture import Network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
-from ginn_jax.geometry import uniform_limits
-from ginn_jax.mesh import sample_surface
+from ginn_jax.presets import compact_network
+from ginn_jax.samples import sample_surface
+from ginn_jax.searches import uniform_limits
 from ginn_jax.train import Training, init_state
 
 # Of the cloud under the frames.
@@ -74,8 +75,8 @@ def over_points(options: Options, scene: reference.Scene) -> list[dict[str, Any]
         limits = uniform_limits(network, max(1 << 14, 4 * count))
         arguments = variables, cloud.position, cloud.normal
         key = jax.random.key(0)
-        encoded, limits = image.encode_cloud(network, limits, *arguments, key=key)
-        call = partial(image.encode_cloud, network, limits, *arguments, key=key)
+        encoded, limits = inference.encode_cloud(network, limits, *arguments, key=key)
+        call = partial(inference.encode_cloud, network, limits, *arguments, key=key)
         timing = measure({"f_3D": call}, options.repeats)["f_3D"]
         kept = int(np.sum(encoded.points.mask))
         rows.append({"size": count, "kept": kept, "timing": timing})
@@ -88,7 +89,7 @@ def over_pixels(options: Options, scene: reference.Scene) -> list[dict[str, Any]
     variables = weights_of(network)
     cloud = lit_scenes.visible_samples(scene, FRAME_POINTS, seed=0)
     limits = uniform_limits(network, 1 << 17)
-    encoded, limits = image.encode_cloud(
+    encoded, limits = inference.encode_cloud(
         network,
         limits,
         variables,

@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ginn_jax.architecture import Network, compact_network
+from ginn_jax.architecture import Network
+from ginn_jax.presets import compact_network
 
 POINTS = 1000
 SMALL = {"k": 4, "levels": (0.0625, 0.1875), "query_radius": 0.125, "latent": 4}

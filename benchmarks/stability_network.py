@@ -16,13 +16,11 @@ from benchmarks.stability_stages import (
     oriented,
     row,
 )
-from ginn_jax import geometry, image, shading, train
+from ginn_jax import geometry, inference, objective, shading, train
 from ginn_jax.dataset import ShadedPoints, stack_clouds
-from ginn_jax.geometry import limit_names
 from ginn_jax.limits import Limits, exceeded, raise_limits
-from ginn_jax.receptive_field import (
-    Oriented,
-)
+from ginn_jax.receptive_field import Oriented
+from ginn_jax.searches import limit_names
 
 # The network
 
@@ -117,10 +115,10 @@ def host_row(case: Case, network: Any, variables: Any) -> Row:
         points = case.position[: case.count], case.normal[: case.count]
         albedo, light = (a[:, : case.count] for a in (case.albedo, case.light))
         limits = roomy(network)
-        encoded, limits = image.encode_cloud(
+        encoded, limits = inference.encode_cloud(
             network, limits, variables, *points, albedo, light, key=jax.random.key(KEY)
         )
-        return image.shade_points(network, limits, variables, encoded, *points)[0]
+        return inference.shade_points(network, limits, variables, encoded, *points)[0]
 
     call = partial(run, case, network)
     home = case
@@ -174,7 +172,7 @@ def train_row(case: Case) -> Row:
             config, limits, train.place(config, state), batch
         )
         assert not exceeded(limits, jax.device_get(told.demands)), case.name
-        params, _ = train.split_variables(after.variables)
+        params, _ = objective.split_variables(after.variables)
         return jax.device_get((told.loss, told.gradient_norm, params))
 
     with double():

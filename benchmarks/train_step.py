@@ -21,22 +21,21 @@ from jaxtyping import Array, Key
 from matplotlib.figure import Figure
 
 from benchmarks.timing import Timing, circumstances, measure
-from ginn_jax import architecture, fit, objects, report, scenes
+from ginn_jax import fit, objects, presets, report, scenes
 from ginn_jax.commandline import require, start
 from ginn_jax.dataset import ShadedPoints
 from ginn_jax.errors import InputError
 from ginn_jax.limits import Limits
 from ginn_jax.network import Variables
+from ginn_jax.objective import batch_loss, split_variables
 from ginn_jax.process import ALONE, available_cores
 from ginn_jax.train import (
     Training,
     TrainState,
-    batch_loss,
     batch_mesh,
     init_state,
     make_example,
     place,
-    split_variables,
     train_step,
 )
 
@@ -176,7 +175,7 @@ def main(options: Options) -> dict[str, Any]:
     require(options, {"shapes": 1, "batch": 1, "points": 500, "queries": 1})
     require(options, {"repeats": 1})
     begin = time.perf_counter()
-    network = architecture.PRESETS[options.preset]
+    network = presets.PRESETS[options.preset]
     config = Training(
         network,
         steps=1000,

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from ginn_jax import architecture, evaluate, fit, objects, report, scenes
+from ginn_jax import evaluate, fit, objects, presets, report, scenes
 from ginn_jax.architecture import Network
 from ginn_jax.commandline import require_positive, start
 from ginn_jax.disk_radius import limits_at, with_disk_radius
@@ -86,7 +86,7 @@ def main(options: Options) -> dict[str, Any]:
     unseen = make(console, "unseen clouds", test_sources, exact, folder / "unseen")
     clock.lap("data", begin)
 
-    network = architecture.PRESETS[options.preset]
+    network = presets.PRESETS[options.preset]
     config = training(options, network, options.points, len(clouds))
     extra = {"data": asdict(settings), "objects": [s.name for s in train_sources]}
     run = train(console, config, clouds, options.out, options.resume, extra)

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ginn_jax.architecture import ILLUMINATION
 from ginn_jax.commandline import start
 from ginn_jax.lit_experiment import QUICK, LitOptions, Preset, run_experiment
 from ginn_jax.lit_scenes import Illumination
+from ginn_jax.presets import ILLUMINATION
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from scipy.spatial import KDTree
 
-from ginn_jax import compare, image
+from ginn_jax import compare, inference
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
 from ginn_jax.lighting import procedural_environment
@@ -103,7 +103,9 @@ def latent_code(
         numbers = network_numbers(cloud)
     ends = weights, samples.position, samples.normal
     key = jax.random.key(options.seed)
-    encoded, _ = image.encode_cloud(config.network, limits, *ends, *numbers, key=key)
+    encoded, _ = inference.encode_cloud(
+        config.network, limits, *ends, *numbers, key=key
+    )
     mask, code = np.asarray(encoded.points.mask), np.asarray(encoded.code.free)
     code = code if code.ndim == 2 else code[0]
     return np.asarray(encoded.points.position)[mask], code[mask]

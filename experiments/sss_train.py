@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ginn_jax.architecture import SCATTERING
 from ginn_jax.commandline import start
 from ginn_jax.errors import InputError
 from ginn_jax.lit_experiment import QUICK, LitOptions, Preset, run_experiment
 from ginn_jax.lit_scenes import Scattering
+from ginn_jax.presets import SCATTERING
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ Modules, in the order the data flows; each imports only what stands before it:
     files             checked before they are read, written whole or not
     process           settings of a process that make XLA faster on CPU
     commandline       options, one-line errors and exit codes of scripts
-    orientation, mesh_files, mesh    triangles: loading, mending, ground, samples
+    orientation, mesh_files, mesh    triangles: loading, mending, ground
+    samples           points on surfaces, drawn from a mesh or read from a scan
     sdf, solids, *_shapes, shapes    the seeded source of procedural objects
     camera            pinhole cameras
     libllvm, renderer the ray tracer, found and loaded
@@ -34,18 +35,22 @@ Modules, in the order the data flows; each imports only what stands before it:
     lit_clouds        clouds in colour on disk, and one channel of them
     lit_scenes        scenes with materials and a light; global illumination, scattering
     scenes            from objects to clouds with ground truth, in worker processes
-    architecture      the network as a table of layers; presets
+    architecture      the network as a table of layers
+    presets           the tables: ours, the paper's, the authors', ablations
     limits            capacities of all searches, and what they needed
-    geometry          levels, edges and weights of a cloud; capacities and demands
+    searches          which searches a network makes, and their capacities' names
+    geometry          levels, edges and weights of a cloud; demands
     network           f_3D and f_2D
     example           what a training step computes before any parameter enters
+    objective         what training minimises
     train             one jitted step: geometry, gradient, update
     checkpoint        saving, resuming, loading weights
     fit               the training loop of a run
     shading           f_3D of a cloud and f_2D of queries, in every colour channel
     disk_radius       a trained network on finer or coarser points
     upsample          shading at a lower rate, guided by the G-buffer
-    image             from a cloud and a G-buffer to an image
+    inference         f_3D of a cloud once, f_2D at any points, sized by themselves
+    image             from a G-buffer to an image
     relight           what does not depend on the light, kept for any light
     screen            what methods that see only the G-buffer share: its coordinates
     screen_slices     the directions round a pixel in planes through the eye

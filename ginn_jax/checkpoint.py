@@ -17,9 +17,9 @@ from ginn_jax.architecture import Conv, Network
 from ginn_jax.checks import LARGEST_INDEX, whole
 from ginn_jax.errors import InputError
 from ginn_jax.files import unwritable, writing
-from ginn_jax.geometry import limit_names
 from ginn_jax.limits import Limits
 from ginn_jax.network import Variables
+from ginn_jax.searches import limit_names
 from ginn_jax.train import Training, TrainState, state_shapes
 
 KEPT = 2

@@ -17,7 +17,8 @@ from ginn_jax.dataset import ShadedPoints, count_given
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model, Row, View
 from ginn_jax.evaluate_light import LitView
-from ginn_jax.image import (
+from ginn_jax.image import within_range
+from ginn_jax.inference import (
     BLOCK,
     block_size,
     encode_cloud,
@@ -25,7 +26,6 @@ from ginn_jax.image import (
     only,
     shade_block,
     shade_points,
-    within_range,
     without,
 )
 from ginn_jax.limits import Limits

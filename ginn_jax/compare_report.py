@@ -163,14 +163,13 @@ def _short(row: Row) -> Row:
 def draw_methods(
     path: Path,
     shots: Sequence[tuple[str, Mapping[str, Float[np.ndarray, "H W *C"]]]],
-    reference: str = "reference",
 ) -> None:
-    """A row a shot, a column a method, each with an enlarged inset."""
+    """A row a shot, a column a method, "reference" too, each with an enlarged inset."""
     names = list(shots[0][1])
     figure = Figure(figsize=(2.6 * len(names), 2.8 * len(shots)), layout="constrained")
     grid = np.atleast_2d(figure.subplots(len(shots), len(names), squeeze=False))
     for line, (title, pictures) in zip(grid, shots, strict=True):
-        right = pictures[reference]
+        right = pictures["reference"]
         corner, size = inset_place(right)
         for axes, name in zip(line, names, strict=True):
             shown = tone_map(pictures[name], right, foreground(right))

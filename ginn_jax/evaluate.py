@@ -11,13 +11,8 @@ from jaxtyping import Array, Bool, Float, Key
 from ginn_jax.architecture import Network
 from ginn_jax.camera import Camera, orbit_camera
 from ginn_jax.dataset import ShadedPoints, count_given
-from ginn_jax.image import (
-    Encoded,
-    as_openness,
-    encode_cloud,
-    shade_image,
-    shade_points,
-)
+from ginn_jax.image import Encoded, as_openness, shade_image
+from ginn_jax.inference import encode_cloud, shade_points
 from ginn_jax.limits import Limits
 from ginn_jax.mesh import Mesh
 from ginn_jax.metrics import (
@@ -125,11 +120,9 @@ def pool_rows(rows: Sequence[Row]) -> Row:
     }
 
 
-def reference_view(
-    mesh: Mesh, radius: float, rays: int, seed: int, size: int, azimuth: float = 35.0
-) -> View:
+def reference_view(mesh: Mesh, radius: float, rays: int, seed: int, size: int) -> View:
     """An object with its ray-traced ambient occlusion at every foreground pixel."""
-    view = frame(mesh, orbit_camera(azimuth, width=size, height=size))
+    view = frame(mesh, orbit_camera(width=size, height=size))
     return with_truth(view, traced(view, radius, rays, seed=seed))
 
 

@@ -15,7 +15,8 @@ from ginn_jax.architecture import Network
 from ginn_jax.camera import Camera, orbit_camera
 from ginn_jax.dataset import count_asked
 from ginn_jax.evaluate import Image, Model, Row, at_scale, fill, timed, timed_network
-from ginn_jax.image import Encoded, encode_cloud, shade_image, shade_points
+from ginn_jax.image import Encoded, shade_image
+from ginn_jax.inference import encode_cloud, shade_points
 from ginn_jax.irradiance import ColorEstimate
 from ginn_jax.limits import Limits
 from ginn_jax.lit_clouds import LitCloud, network_numbers, split_points
@@ -27,14 +28,10 @@ from ginn_jax.lit_scenes import (
     lit_points,
     transport,
 )
-from ginn_jax.mesh import Samples
-from ginn_jax.metrics import (
-    dssim,
-    relative_error,
-    tone_map,
-)
+from ginn_jax.metrics import dssim, relative_error, tone_map
 from ginn_jax.objects import Source
 from ginn_jax.reference import GBuffer, build_scene, render_gbuffer
+from ginn_jax.samples import Samples
 
 
 class LitView(NamedTuple):
@@ -125,10 +122,9 @@ def lit_view(
     settings: Illumination | Scattering,
     paths: int,
     size: int,
-    azimuth: float = 35.0,
 ) -> LitView:
     """A source with its path-traced reference at every foreground pixel."""
-    camera = orbit_camera(azimuth, width=size, height=size)
+    camera = orbit_camera(width=size, height=size)
     view = lit_frame(light_up(source, settings), camera, settings, seed=source.seed)
     return with_truth(view, traced(view, paths, seed=source.seed))
 

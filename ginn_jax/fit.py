@@ -22,9 +22,9 @@ from ginn_jax.checkpoint import (
 from ginn_jax.dataset import ShadedPoints, batch_order, stack_clouds
 from ginn_jax.errors import InputError
 from ginn_jax.files import writing
-from ginn_jax.geometry import uniform_limits
-from ginn_jax.limits import Limits, exceeded, measure_limits, widened
+from ginn_jax.limits import SLACK, Limits, exceeded, measure_limits, widened
 from ginn_jax.lit_clouds import Cloud, channel_of
+from ginn_jax.searches import uniform_limits
 from ginn_jax.train import (
     Training,
     TrainState,
@@ -36,8 +36,6 @@ from ginn_jax.train import (
 )
 
 PROBES = 300
-PROBE_SLACK = 1.25
-RAISE_SLACK = 1.25
 
 
 @dataclass(frozen=True)
@@ -83,31 +81,26 @@ def fit(
     """
     _check(config, clouds)
     folder.mkdir(parents=True, exist_ok=True)
-    start = time.perf_counter()
+    start, extra = time.perf_counter(), extra or {}
     if resume:
-        limits, seconds = load_run(folder, config, extra or {})
+        limits, seconds = load_run(folder, config, extra)
     else:
         limits, seconds = training_limits(config, clouds), dict(UNSPENT)
-        save_run(folder, config, limits, extra or {}, seconds)
+        save_run(folder, config, limits, extra, seconds)
     manager = open_manager(folder, fresh=not resume)
-    state = init_state(config)
-    losses = np.zeros(0, np.float32)
+    state, history, raised = init_state(config), list[float](), dict[str, int]()
     if resume and (found := restore_state(manager, state)) is not None:
-        state, losses = found, load_losses(folder, int(found.step))
+        state, history = found, load_losses(folder, int(found.step)).tolist()
     seconds["compile"] += time.perf_counter() - start
-    history: list[float] = losses.tolist()
-    raised: dict[str, int] = {}
     compiled_for = None
     while int(state.step) < config.steps:
         step = int(state.step)
         begin = time.perf_counter()
-        state, report = train_step(
-            config, limits, state, step_batch(config, clouds, step)
-        )
+        batch = step_batch(config, clouds, step)
+        state, report = train_step(config, limits, state, batch)
         loss = float(report.loss)
         if short := exceeded(limits, jax.device_get(report.demands)):
-            measured = batch_limits(config, clouds, step)
-            wider = widened(limits, measured, short)
+            wider = widened(limits, batch_limits(config, batch, step), short)
             more = {n: size for n, size in wider.sizes if size > limits.of(n)}
             progress(step, loss, f"raised {', '.join(more)}")
             limits, raised = wider, raised | more
@@ -121,7 +114,7 @@ def fit(
             progress(step + 1, recent_loss(history, schedule.report), "")
         if (step + 1) % schedule.save == 0 or step + 1 == config.steps:
             save_losses(folder, history)
-            save_run(folder, config, limits, extra or {}, seconds)
+            save_run(folder, config, limits, extra, seconds)
             save_state(manager, state)
     finish(manager)
     return Fit(state, limits, np.array(history, np.float32), seconds, raised)
@@ -147,12 +140,11 @@ def training_limits(config: Training, clouds: Sequence[Cloud]) -> Limits:
         return jax.device_get(probe_step(config, limits, batch, key=jax.random.key(i)))
 
     generous = uniform_limits(config.network, 16 * share * config.points)
-    return measure_limits(generous, probe, probes, PROBE_SLACK)
+    return measure_limits(generous, probe, probes, SLACK)
 
 
-def batch_limits(config: Training, clouds: Sequence[Cloud], step: int) -> Limits:
+def batch_limits(config: Training, batch: ShadedPoints, step: int) -> Limits:
     """Capacities that hold the batch of a step, with slack."""
-    batch = step_batch(config, clouds, step)
     devices = batch_mesh(config.batch_size).size
     size = config.batch_size // devices
 
@@ -162,7 +154,7 @@ def batch_limits(config: Training, clouds: Sequence[Cloud], step: int) -> Limits
         return jax.device_get(probe_step(config, limits, share, key=key))
 
     ample = uniform_limits(config.network, 16 * size * config.points)
-    return measure_limits(ample, probe, devices, RAISE_SLACK)
+    return measure_limits(ample, probe, devices, SLACK)
 
 
 def save_losses(folder: Path, history: Sequence[float]) -> None:

@@ -23,6 +23,7 @@ from ginn_jax.receptive_field import (
     point_area,
     surface_weight,
 )
+from ginn_jax.searches import area_search, needs_areas, transposed
 from ginn_jax.voxels import VoxelGrid, build_grid
 
 
@@ -40,44 +41,6 @@ class Geometry(NamedTuple):
     fields: dict[str, Field]
     area: Array | None
     grid: VoxelGrid
-
-
-def limit_names(network: Network) -> tuple[str, ...]:
-    """The name of every capacity of a network."""
-    names = [
-        f"level_{i}.{part}"
-        for i in range(len(network.levels))
-        for part in (*Demand._fields, "points")
-    ]
-    if needs_areas(network):
-        names += [f"{area_search(network).name}.{part}" for part in Demand._fields]
-    for conv in (*network.encoder, network.query):
-        if conv is not network.query and transposed(network, conv):
-            continue
-        names += [f"{conv.name}.{part}" for part in Demand._fields]
-        names += [f"{conv.name}.pairs"] if network.density == "kde" else []
-    return tuple(names)
-
-
-def needs_areas(network: Network) -> bool:
-    """Whether no convolution's edges tell the area that finest points stand for."""
-    within = any(c.source == c.target == 0 for c in network.encoder)
-    return network.density == "surface" and not within
-
-
-def area_search(network: Network) -> Conv:
-    """The search that tells it then, as wide as a convolution's would be."""
-    return Conv("area", 0, 0, 2.5 * network.levels[0], 0.25, 1)
-
-
-def uniform_limits(network: Network, size: int) -> Limits:
-    """The same capacity for everything (a word is worth many): to start measuring."""
-    return Limits(
-        tuple(
-            (name, max(size // 64, 64) if name.endswith(".words") else size)
-            for name in limit_names(network)
-        )
-    )
 
 
 def search(
@@ -187,23 +150,6 @@ def grid_of(
         cell = min(radii, default=2 * network.levels[0])
         grids[level] = build_grid(points.position, points.mask, jnp.float32(cell))
     return grids[level]
-
-
-def transposed(network: Network, conv: Conv) -> str | None:
-    """The later convolution over the same pairs in the other direction, if any.
-
-    The paper's density needs edges sorted by receiver, so there each is searched.
-    """
-    if network.density == "kde":
-        return None
-    for other in network.encoder[network.encoder.index(conv) + 1 :]:
-        ends = (other.target, other.source, other.radius)
-        if (
-            ends == (conv.source, conv.target, conv.radius)
-            and other.source != other.target
-        ):
-            return other.name
-    return None
 
 
 def _build_levels(

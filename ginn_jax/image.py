@@ -1,200 +1,28 @@
-"""From a cloud and a G-buffer to an image: f_3D once, f_2D for the pixels in sight.
+"""From a G-buffer to an image: f_2D at the pixels in sight, or at some of them.
 
-A pixel is a point, so the same two functions give values at points of a cloud. Both are
-host-level: they hold no more than a block of queries at a time, and where a capacity is
-too small they raise it and try again; the limits that sufficed come back for reuse.
+A pixel is a point: points are shaded, in an order that keeps neighbours together.
 """
 
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Bool, Float, Int
 
 from ginn_jax.architecture import Network
-from ginn_jax.checks import LARGEST, number, real_array, unit_rows
-from ginn_jax.dataset import center_of, relative_to
+from ginn_jax.checks import LARGEST, number
 from ginn_jax.errors import InputError
-from ginn_jax.geometry import uniform_limits
-from ginn_jax.limits import (
-    SLACK,
-    Demands,
-    Limits,
-    measure_limits,
-    say_raised,
-    with_room,
-)
-from ginn_jax.neighbors import bucket, pad_rows
+from ginn_jax.inference import shade_points
+from ginn_jax.limits import Limits
 from ginn_jax.network import Variables
-from ginn_jax.process import ALONE
-from ginn_jax.receptive_field import Oriented
-from ginn_jax.shading import (
-    Encoded,
-    cloud_demands,
-    encode,
-    numbers_asked,
-    shade,
-)
+from ginn_jax.shading import Encoded, numbers_asked
 from ginn_jax.upsample import Surface, sample_pixels, upsample
 from ginn_jax.voxels import morton_code
 
-BLOCK = 1 << 15
-
-encode_whole = jax.jit(encode, static_argnums=(0, 1))
-shade_block = jax.jit(
-    shade, static_argnums=(0, 1), static_argnames="coherent", compiler_options=ALONE
-)
-_cloud_demands = jax.jit(cloud_demands, static_argnums=(0, 1))
 _upsample = jax.jit(upsample)
 _coarse_cells = jax.jit(lambda *points: morton_code(*points, bits=5).astype(jnp.uint16))
-
-
-def encode_cloud(
-    network: Network,
-    limits: Limits,
-    variables: Variables,
-    position: Float[np.ndarray, "N 3"],
-    normal: Float[np.ndarray, "N 3"],
-    material: Float[np.ndarray, "C N A"] | None = None,
-    light: Float[np.ndarray, "C N L"] | None = None,
-    *,
-    key: Key[Array, ""],
-) -> tuple[Encoded, Limits]:
-    """Codes of a cloud, and the limits that sufficed.
-
-    Raises:
-        InputError: an empty cloud, or one that is not finite; normals that are not of
-            unit length; material or light that the network does not take.
-    """
-    if not np.size(position):
-        raise InputError("the cloud is empty: sample at least one point")
-    unit_rows(position, normal, "the cloud")
-    check_numbers("material", material, network.materials, len(position))
-    check_numbers("light", light, network.lights, len(position))
-    rows = bucket(len(position))
-    center = center_of(position)
-    padded, mask = pad_rows(relative_to(center, position), rows)
-    turned, _ = pad_rows(np.asarray(normal, np.float32), rows)
-    cloud = Oriented(padded, turned, mask)
-    more = pad_channels(material, rows), pad_channels(light, rows)
-
-    def attempt(limits: Limits) -> tuple[Encoded, list[Demands]]:
-        deep = without(limits, network.query.name)
-        made, demands = encode_whole(network, deep, variables, cloud, *more, key)
-        return made, [demands]
-
-    measure = partial(cloud_limits, network, cloud, key=key)
-    encoded, sufficed = with_room(limits, attempt, measure)
-    say_raised(limits, sufficed)
-    return encoded._replace(center=center), sufficed
-
-
-def cloud_limits(network: Network, cloud: Oriented, *, key: Key[Array, ""]) -> Limits:
-    """Limits that hold what f_3D of a cloud needs, measured with ample ones."""
-    ample = uniform_limits(network, 16 * cloud.mask.shape[0])
-
-    def probe(limits: Limits, _: int) -> Demands:
-        deep = without(limits, network.query.name)
-        return jax.device_get(_cloud_demands(network, deep, cloud, key))
-
-    return measure_limits(ample, probe, 1, SLACK)
-
-
-def check_numbers(name: str, numbers: Any, width: int, rows: int) -> None:
-    """Raise `InputError` unless so many numbers come with each of these points."""
-    if width == 0 and numbers is not None:
-        raise InputError(f"the network takes no {name}: leave it out")
-    given = real_array(name, () if numbers is None else numbers)
-    shape = given.shape
-    if width and (len(shape) != 3 or shape[1:] != (rows, width)):
-        raise InputError(f"{name} is {shape}, the network takes [C {rows} {width}]")
-    if width and not np.isfinite(given).all():
-        raise InputError(f"{name} holds non-finite numbers: remove those points")
-
-
-def pad_channels(
-    numbers: Float[np.ndarray, "C N A"] | None, rows: int
-) -> Float[np.ndarray, "C R A"] | None:
-    """Zeros for rows up to `rows`."""
-    if numbers is None:
-        return None
-    padding = ((0, 0), (0, rows - numbers.shape[1]), (0, 0))
-    return np.pad(np.asarray(numbers, np.float32), padding)
-
-
-def only(limits: Limits, conv: str) -> Limits:
-    """The limits of one convolution: others must not make it compile again."""
-    return Limits(tuple(s for s in limits.sizes if s[0].startswith(f"{conv}.")))
-
-
-def without(limits: Limits, conv: str) -> Limits:
-    """The limits of everything else."""
-    return Limits(tuple(s for s in limits.sizes if not s[0].startswith(f"{conv}.")))
-
-
-def block_size(points: int, lit: bool) -> int:
-    """Queries of a block: half as many where three colours share a core's cache."""
-    return min(BLOCK // 2 if lit else BLOCK, bucket(points))
-
-
-def shade_points(
-    network: Network,
-    limits: Limits,
-    variables: Variables,
-    encoded: Encoded,
-    position: Float[np.ndarray, "M 3"],
-    normal: Float[np.ndarray, "M 3"],
-    material: Float[np.ndarray, "C M A"] | None = None,
-    light: Float[np.ndarray, "C M L"] | None = None,
-    coherent: bool = False,
-) -> tuple[Float[np.ndarray, "M *C"], Limits]:
-    """Values at any points, in blocks over all devices; the limits that sufficed.
-
-    With light they have a last axis of channels. `material` and `light` of the points
-    themselves are needed only where the network asks for all. Points that come
-    `coherent`, neighbours together, need not be sorted.
-
-    Raises:
-        InputError: as `encode_cloud`, but for no points at all, which have no values.
-    """
-    unit_rows(position, normal)
-    if network.asks == "all":
-        check_numbers("material", material, network.materials, len(position))
-        check_numbers("light", light, network.lights, len(position))
-    center, encoded = encoded.center, encoded._replace(center=None)
-    needed = {"shader": variables["shader"]}, encoded
-    copies = [jax.device_put(needed, device) for device in jax.devices()]
-    size = block_size(len(position), encoded.scale is not None)
-    rows = -(-len(position) // size) * size
-    place, mask = pad_rows(relative_to(center, position), rows)
-    turned, _ = pad_rows(np.asarray(normal, np.float32), rows)
-    whole = Oriented(place, turned, mask)
-    asked = numbers_asked(network, material, light)
-    numbers = tuple(pad_channels(a, rows) for a in asked)
-
-    def attempt(limits: Limits) -> tuple[list[Array], list[Demands]]:
-        parts, demands = [], []
-        flat = only(limits, network.query.name)
-        for turn, first in enumerate(range(0, rows, size)):
-            block = slice(first, first + size)
-            queries = Oriented(*(a[block] for a in whole))
-            own = (None if a is None else a[:, block] for a in numbers)
-            arrays = copies[turn % len(copies)]
-            values, demand = shade_block(
-                network, flat, *arrays, queries, *own, coherent=coherent
-            )
-            parts.append(values)
-            demands.append(demand)
-        return parts, demands
-
-    parts, sufficed = with_room(limits, attempt)
-    say_raised(limits, sufficed)
-    channels = () if encoded.scale is None else encoded.scale.shape
-    values = [np.zeros((0, *channels), np.float32)]
-    values += [np.moveaxis(np.asarray(part), -1, 0) for part in parts]
-    return np.concatenate(values)[: len(position)], sufficed
 
 
 @lru_cache(maxsize=8)
@@ -244,21 +72,12 @@ def shade_image(
         InputError: a resolution scale outside (0, 1], arrays of unequal size, a mask
             that is not of bool, or pixels in it that `shade_points` refuses.
     """
+    check_image(position, normal, mask, background, resolution_scale)
     mask = np.asarray(mask)
-    if mask.dtype != bool or mask.ndim != 2:
-        raise InputError(f"mask is {mask.dtype} {mask.shape}: give bool [H W]")
-    number("background", background, -LARGEST)
-    if not np.shape(position) == np.shape(normal) == (*mask.shape, 3):
-        raise InputError(
-            f"position {np.shape(position)} and normal {np.shape(normal)} do not fit "
-            f"the mask {mask.shape}: give [H W 3]"
-        )
-    if not 0 < resolution_scale <= 1:
-        raise InputError(f"resolution scale {resolution_scale}: give it in (0, 1]")
     channels = () if encoded.scale is None else encoded.scale.shape
     values = np.full((*mask.shape, *channels), background, np.float32)
     material, light = numbers_asked(network, material, light)
-    pixel, surface = coherent_pixels(position, mask), Surface(position, normal, mask)
+    pixel = coherent_pixels(position, mask)
 
     def compute(wanted: Bool[np.ndarray, "H W"], limits: Limits) -> Limits:
         rows = pixel[wanted.reshape(-1)[pixel]]
@@ -278,14 +97,30 @@ def shade_image(
     sampled = np.zeros_like(mask)
     sampled[np.ix_(*places)] = mask[np.ix_(*places)]
     limits = compute(sampled, limits)
-    coarse, thickness = values[np.ix_(*places)], 0.2 * network.query.radius
-    between, known = map(np.asarray, _upsample(coarse, *places, surface, thickness))
+    surface, thickness = Surface(position, normal, mask), 0.2 * network.query.radius
+    given = values[np.ix_(*places)], *places, surface, thickness
+    between, known = map(np.asarray, _upsample(*given))
     rest = mask & ~sampled
-    filled = rest & known
-    np.copyto(
-        values, between, where=filled.reshape(*mask.shape, *(1 for _ in channels))
-    )
+    filled = (rest & known).reshape(*mask.shape, *(1 for _ in channels))
+    np.copyto(values, between, where=filled)
     return values, compute(rest & ~known, limits)
+
+
+def check_image(
+    position: Any, normal: Any, mask: Any, background: float, resolution_scale: float
+) -> None:
+    """Raise `InputError` for what is no G-buffer, or no way to shade one."""
+    mask = np.asarray(mask)
+    if mask.dtype != bool or mask.ndim != 2:
+        raise InputError(f"mask is {mask.dtype} {mask.shape}: give bool [H W]")
+    number("background", background, -LARGEST)
+    if not np.shape(position) == np.shape(normal) == (*mask.shape, 3):
+        raise InputError(
+            f"position {np.shape(position)} and normal {np.shape(normal)} do not fit "
+            f"the mask {mask.shape}: give [H W 3]"
+        )
+    if not 0 < resolution_scale <= 1:
+        raise InputError(f"resolution scale {resolution_scale}: give it in (0, 1]")
 
 
 def within_range(

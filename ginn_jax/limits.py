@@ -20,7 +20,7 @@ from ginn_jax.errors import InputError
 LOG = logging.getLogger("ginn_jax")
 Demands = dict[str, Int[Any, ""]]
 Made = TypeVar("Made")
-# What host-level calls make room for beyond what they needed.
+# What is made room for beyond what was needed.
 SLACK = 1.25
 
 

@@ -242,8 +242,12 @@ def image_evaluation(
 
 
 def panels(view: evaluate_light.LitView, values: np.ndarray) -> list[np.ndarray]:
-    """Displayed reference and prediction, then the transported light of both alone."""
+    """Displayed reference and prediction, then the indirect light of both alone.
+
+    What leaves a medium is displayed as it is: there it comes once.
+    """
     target, mask = view.pixels.target, view.gbuffer.mask
-    whole = (evaluate_light.displayed(view, light) for light in (target, values))
-    alone = (fill(mask, light) for light in (target, values))
-    return [*whole, *alone]
+    whole = [evaluate_light.displayed(view, light) for light in (target, values)]
+    if view.pixels.medium.size:
+        return whole
+    return [*whole, *(fill(mask, light) for light in (target, values))]

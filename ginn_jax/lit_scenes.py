@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ginn_jax.checks import positive, whole
 from ginn_jax.errors import InputError, InputWarning
@@ -22,9 +22,10 @@ from ginn_jax.irradiance import (
 )
 from ginn_jax.lighting import Light
 from ginn_jax.lit_clouds import LitCloud
-from ginn_jax.mesh import Mesh, Samples, sample_surface
+from ginn_jax.mesh import Mesh
 from ginn_jax.objects import Source, load_light, load_object
 from ginn_jax.reference import Scene, ambient_occlusion, build_scene
+from ginn_jax.samples import Samples, sample_surface
 from ginn_jax.slab import single_scattering_albedo
 from ginn_jax.subsurface import Medium, subsurface_exitance
 
@@ -210,14 +211,22 @@ def visible_samples(
 
 def sample_sides(mesh: Mesh, count: int, seed: int, both_sides: bool) -> Samples:
     """At most `count` uniform samples; the normals of the object's to either side."""
-    samples = sample_surface(mesh, count, seed=seed)
-    if not both_sides:
-        return samples
-    position, normal, material = samples
-    behind = np.random.default_rng((seed, 7)).random(count) < 0.5
+    position, normal, material = sample_surface(mesh, count, seed=seed)
+    behind, kept = draw_sides(material, both_sides, seed)
     normal = np.where(behind[:, None], -normal, normal)
-    kept = ~behind | (material == OBJECT)
     return Samples(position[kept], normal[kept], material[kept])
+
+
+def draw_sides(
+    material: Int[np.ndarray, "N"], both_sides: bool, seed: int
+) -> tuple[Bool[np.ndarray, "N"], Bool[np.ndarray, "N"]]:
+    """Which samples are of the back of their face, and which to keep of all.
+
+    Half are of the back where both sides count, but what is under the ground is not.
+    """
+    drawn = np.random.default_rng((seed, 7)).random(len(material)) < 0.5
+    behind = drawn & both_sides
+    return behind, ~behind | (material == OBJECT)
 
 
 def reached_by_light(scene: Scene, samples: Samples, seed: int) -> Int[np.ndarray, "K"]:

@@ -15,7 +15,7 @@ from ginn_jax.architecture import Network
 from ginn_jax.checks import unit_rows
 from ginn_jax.dataset import center_of, relative_to
 from ginn_jax.geometry import Geometry, build_geometry, build_query_field
-from ginn_jax.image import block_size, cloud_limits, only, pad_channels, without
+from ginn_jax.inference import block_size, cloud_limits, only, pad_channels, without
 from ginn_jax.limits import Demands, Limits, say_raised, with_room
 from ginn_jax.lit_clouds import LitCloud, network_numbers
 from ginn_jax.mcconv import stored_kernel

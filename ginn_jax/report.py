@@ -130,9 +130,10 @@ def draw_color_views(
     path: Path,
     views: Sequence[tuple[str, Sequence[np.ndarray]]],
 ) -> None:
-    """Rows of a title and four panels: reference, prediction, transport of both."""
-    figure = Figure(figsize=(12.4, 3.1 * len(views)), layout="constrained")
-    grid = np.atleast_2d(figure.subplots(len(views), 4, squeeze=False))
+    """Rows of a title and panels: reference, prediction, transport of both if any."""
+    wide = len(views[0][1])
+    figure = Figure(figsize=(3.1 * wide, 3.1 * len(views)), layout="constrained")
+    grid = np.atleast_2d(figure.subplots(len(views), wide, squeeze=False))
     names = ("reference", "network", "transported light alone", "network, alone")
     for row, (title, panels) in zip(grid, views, strict=True):
         for number, (axes, panel) in enumerate(zip(row, panels, strict=True)):

@@ -12,9 +12,10 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 
 from ginn_jax.errors import InputError
-from ginn_jax.lit_scenes import OBJECT, reached_by_light
-from ginn_jax.mesh import Mesh, Samples, add_ground, fit_unit_box
+from ginn_jax.lit_scenes import draw_sides, reached_by_light
+from ginn_jax.mesh import Mesh, add_ground, fit_unit_box
 from ginn_jax.reference import build_scene
+from ginn_jax.samples import Samples
 from ginn_jax.shapes import random_shape
 
 
@@ -110,8 +111,7 @@ def carried_samples(
     shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     drawn = 5 * count
     place, face = trimesh.sample.sample_surface(shape, drawn, seed=seed)[:2]
-    behind = np.random.default_rng((seed, 8)).random(drawn) < 0.5
-    kept = ~behind | (both_sides & (mesh.material[face] == OBJECT))
+    behind, kept = draw_sides(mesh.material[face], both_sides, seed)
     place, face, behind = place[kept], face[kept], behind[kept]
     corners = mesh.vertices[mesh.faces[face]]
     barycentric = trimesh.triangles.points_to_barycentric(corners, place)

@@ -64,12 +64,6 @@ def slab_albedo(alpha: float, ior: float) -> float:
     return float(leaving @ rising / leaving.sum())
 
 
-def internal_reflectance(ior: float) -> float:
-    """Share of diffuse light inside that the boundary reflects, totally or not."""
-    _, share, mirrored = _inner_directions(ior)
-    return float(share @ mirrored)
-
-
 def external_reflectance(ior: float) -> float:
     """Share of diffuse light outside that the boundary reflects."""
     x, weight = _gauss(2 * NODES)

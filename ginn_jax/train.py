@@ -20,10 +20,11 @@ from ginn_jax.architecture import Network
 from ginn_jax.checks import LARGEST_INDEX, LARGEST_SEED, one_of, positive, whole
 from ginn_jax.dataset import ShadedPoints
 from ginn_jax.example import Example, thin_and_search
-from ginn_jax.geometry import uniform_limits
 from ginn_jax.limits import Demands, Limits, fits
-from ginn_jax.network import Encoder, Shader, Variables
+from ginn_jax.network import Variables
+from ginn_jax.objective import batch_loss, init_variables, split_variables
 from ginn_jax.process import ALONE
+from ginn_jax.searches import uniform_limits
 
 
 @dataclass(frozen=True)
@@ -89,65 +90,6 @@ def make_optimizer(config: Training) -> optax.GradientTransformation:
             config.steps,
         )
     return optax.chain(optax.clip_by_global_norm(config.clip_norm), optax.adam(rate))
-
-
-def infer(
-    network: Network, variables: Variables, example: Example, train: bool = False
-) -> tuple[Float[Array, "M"], Variables]:
-    """f_2D after f_3D, and the running moments of batch norm (changed if `train`)."""
-    encoder, shader = Encoder(network, train), Shader(network, train)
-    (code, moments_3d) = encoder.apply(
-        variables["encoder"], *example.given, example.geometry, mutable=["batch_stats"]
-    )
-    (values, moments_2d) = shader.apply(
-        variables["shader"],
-        code,
-        *example.asked,
-        example.queries.mask,
-        example.field,
-        mutable=["batch_stats"],
-    )
-    return values, {"encoder": moments_3d, "shader": moments_2d}
-
-
-def init_variables(
-    network: Network, example: Example, *, key: Key[Array, ""]
-) -> Variables:
-    """Initial parameters and moments; `example` gives the shapes."""
-    encoder_key, shader_key = jax.random.split(key)
-    code, encoder = Encoder(network, True).init_with_output(
-        encoder_key, *example.given, example.geometry
-    )
-    shader = Shader(network, True).init(
-        shader_key, code, *example.asked, example.queries.mask, example.field
-    )
-    return {"encoder": encoder, "shader": shader}
-
-
-def batch_loss(
-    params: Variables, moments: Variables, network: Network, example: Example
-) -> tuple[Float[Array, ""], Variables]:
-    """Mean squared error over the queries, the paper's L2 loss.
-
-    Targets are in units of their cloud's mean light, so that bright clouds and suns
-    weigh no more than others; an L2 loss keeps unbiased noisy targets unbiased.
-    """
-    variables = {part: params[part] | moments[part] for part in params}
-    queries = example.queries
-    values, moments = infer(network, variables, example, train=True)
-    squared = jnp.where(queries.mask, (values - example.target) ** 2, 0.0)
-    count = jnp.sum(queries.mask, dtype=jnp.float32)
-    return jnp.sum(squared) / jnp.maximum(count, 1.0), moments
-
-
-def split_variables(variables: Variables) -> tuple[Variables, Variables]:
-    """Parameters, which are trained, and moments, which are tracked."""
-    params = {part: {"params": v["params"]} for part, v in variables.items()}
-    moments = {
-        part: {name: v[name] for name in v if name != "params"}
-        for part, v in variables.items()
-    }
-    return params, moments
 
 
 def batch_mesh(batch_size: int) -> DeviceMesh:

@@ -16,6 +16,15 @@ settings.register_profile(
 settings.load_profile("ginn_jax")
 
 
+def pytest_configure(config):
+    """What XLA compiled is kept for other processes, their children and other runs."""
+    folder = str(config.cache.mkdir("xla"))
+    jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+
+
 # What takes longest begins first, so that the processes end together.
 LONGEST = (
     "pretrained",

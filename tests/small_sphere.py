@@ -8,7 +8,8 @@ import numpy as np
 
 from ginn_jax import geometry as ge
 from ginn_jax import limits as lm
-from ginn_jax.architecture import compact_network
+from ginn_jax import searches as se
+from ginn_jax.presets import compact_network
 from ginn_jax.receptive_field import Oriented
 
 RADIUS = 0.5
@@ -53,7 +54,7 @@ def demands_of(config, limits, stages, cloud, queries):
 
 
 def generous(config):
-    names = ge.limit_names(config)
+    names = se.limit_names(config)
     return lm.Limits(tuple((n, GENEROUS[n.split(".")[1]]) for n in names))
 
 

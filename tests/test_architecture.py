@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from ginn_jax.architecture import PAPER, QUERY, RELEASED
+from ginn_jax.architecture import QUERY
 from ginn_jax.geometry import Geometry
 from ginn_jax.network import Encoder, Shader
+from ginn_jax.presets import PAPER, RELEASED
 from ginn_jax.receptive_field import Field, Oriented
 
 # From the authors' release: levels, radius, bandwidth, channels, channels with skip,

@@ -18,7 +18,7 @@ from damaged import (
     zeros,
 )
 
-from ginn_jax import lighting, mesh
+from ginn_jax import lighting, mesh, samples
 from ginn_jax.renderer import use_mitsuba
 
 TEXT_PLY = BOX.export(file_type="ply", encoding="ascii")
@@ -78,7 +78,7 @@ ROWS = [
             ("a.obj", mesh.load_mesh),
             ("a.stl", mesh.load_mesh),
             ("a.glb", mesh.load_mesh),
-            ("p.ply", mesh.load_points),
+            ("p.ply", samples.load_points),
             ("a.hdr", MAP),
             ("a.exr", MAP),
         )
@@ -137,34 +137,34 @@ ROWS = [
     Row(
         "no rows",
         holds(POINTS.format(0), "p.ply"),
-        mesh.load_points,
+        samples.load_points,
         "cannot be read .*; export it anew",
     ),
     Row(
         "5 rows, 1 there",
         holds(ONE_POINT.format(5), "p.ply"),
-        mesh.load_points,
+        samples.load_points,
         "cannot be read .cut short.; export it anew",
     ),
     Row(
         "no normals",
         holds(ONE_POINT.format(1).replace(" nx", " a"), "p.ply"),
-        mesh.load_points,
+        samples.load_points,
         "no normals; estimate them",
     ),
     Row(
         "zero normal",
         holds(ONE_POINT.format(1).replace("0 1 0\n", "0 0 0\n"), "p.ply"),
-        mesh.load_points,
+        samples.load_points,
         "zero normal; drop them",
     ),
     Row(
         "3 of 4 not finite or zero",
         holds(POINTS.format(4) + BAD_POINTS, "p.ply"),
-        mesh.load_points,
+        samples.load_points,
         "3 points have a non-finite value or a zero normal; drop them",
     ),
-    Row("a mesh", holds(PLY, "p.ply"), mesh.load_points, "a mesh, .* use load_mesh"),
+    Row("a mesh", holds(PLY, "p.ply"), samples.load_points, "a mesh, .* use load_mesh"),
     Row(
         "points as a mesh",
         holds(ONE_POINT.format(1), "p.ply"),

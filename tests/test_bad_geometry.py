@@ -19,9 +19,9 @@ from refusals import (
     each_row,
 )
 
-from ginn_jax import camera, hierarchy, mesh, neighbors, reference, shapes
+from ginn_jax import camera, hierarchy, mesh, neighbors, reference, samples, shapes
 
-CLOUD = mesh.Samples(POINTS, UP, np.zeros(20, np.int32))
+CLOUD = samples.Samples(POINTS, UP, np.zeros(20, np.int32))
 ORIGIN, TARGET = (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
 
 
@@ -30,11 +30,11 @@ def disk(points, radius):
 
 
 def sample(shape=BOX, count=5, seed=0):
-    return mesh.sample_surface(shape, count, seed=seed)
+    return samples.sample_surface(shape, count, seed=seed)
 
 
 def ground(cloud=CLOUD, half_extent=0.8, seed=0):
-    return mesh.add_ground_samples(cloud, half_extent, seed=seed)
+    return samples.add_ground_samples(cloud, half_extent, seed=seed)
 
 
 def occlusion(**change):
@@ -100,7 +100,7 @@ TABLE: Table = {
         ((BOX._replace(vertices=BOX.vertices * NAN),), "object: empty or not finite"),
         ((BOX._replace(vertices=BOX.vertices * 0),), "object: all points coincide"),
     ],
-    mesh.fit_unit_box_points: [
+    samples.fit_unit_box_points: [
         ((CLOUD._replace(position=POINTS * 0),), "object: all points coincide"),
     ],
     mesh.add_ground: [
@@ -121,7 +121,10 @@ TABLE: Table = {
     ],
     ground: [
         ((CLOUD, -1.0), "half_extent -1.0 must be positive"),
-        ((mesh.Samples(*(a[:8] for a in CLOUD)),), "point cloud: fewer than 9 points"),
+        (
+            (samples.Samples(*(a[:8] for a in CLOUD)),),
+            "point cloud: fewer than 9 points",
+        ),
         ((CLOUD, 1e9), "half_extent 1000000000.0 takes .* points: lower"),
         ((CLOUD._replace(position=POINTS * NAN),), "points holds non-finite"),
         ((CLOUD._replace(position=POINTS[:, :2]),), r"must both be \[N, 3\]"),

@@ -9,8 +9,8 @@ import numpy as np
 import tiny
 from refusals import INF, KEY, NAN, POINTS, UP, WORDS, Table, assert_refused, each_row
 
-from ginn_jax import architecture, image, metrics
-from ginn_jax.geometry import uniform_limits
+from ginn_jax import image, inference, metrics, presets
+from ginn_jax.searches import uniform_limits
 
 PICTURE = np.ones((12, 12))
 FRAME = {"position": POINTS.reshape(4, 5, 3), "normal": UP.reshape(4, 5, 3)}
@@ -19,12 +19,12 @@ FRAME = {"position": POINTS.reshape(4, 5, 3), "normal": UP.reshape(4, 5, 3)}
 def encode(network=tiny.NETWORK, limits=tiny.LIMITS, **change):
     """Nothing is computed: what is wrong is said before."""
     given = {"position": POINTS, "normal": UP, "key": KEY} | change
-    return image.encode_cloud(network, limits, {}, **given)
+    return inference.encode_cloud(network, limits, {}, **given)
 
 
 def shade(network=tiny.NETWORK, **change):
     given = {"position": POINTS, "normal": UP} | change
-    return image.shade_points(network, tiny.LIMITS, {}, None, **given)
+    return inference.shade_points(network, tiny.LIMITS, {}, None, **given)
 
 
 def frame(**change):
@@ -45,7 +45,7 @@ def conv(**change):
 
 
 LIT = replace(tiny.NETWORK, lights=1)
-OTHER = uniform_limits(architecture.RELEASED, 64)
+OTHER = uniform_limits(presets.RELEASED, 64)
 
 TABLE: Table = {
     encode: [
@@ -88,7 +88,7 @@ TABLE: Table = {
     ],
     metrics.equal_rays: [((1.0, INF), "equal rays of MSE 1.0, variance inf")],
     metrics.tone_map: [((PICTURE, PICTURE * NAN), "not finite")],
-    architecture.compact_network: [
+    presets.compact_network: [
         ({"k": 0}, "channels of conv_0 0 must be from 1"),
         ({"levels": (-1.0, 0.1)}, "level.* must be positive|radius .* positive"),
         ({"levels": (0.1, 0.05)}, r"levels \(0.1, 0.05\): give at least one, finest"),

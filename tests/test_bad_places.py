@@ -21,7 +21,7 @@ from damaged import contents, refused
 from saved import STATE, restore, save_state
 
 from experiments import ao_train, gi_train
-from ginn_jax import checkpoint, commandline, dataset, fit, lighting, mesh
+from ginn_jax import checkpoint, commandline, dataset, fit, lighting, mesh, samples
 from ginn_jax.errors import InputError
 
 NOBODY = 65534
@@ -113,7 +113,7 @@ def test_full_disk_leaves_no_checkpoint(tmp_path):
     ("name", "call"),
     [
         ("a.ply", mesh.load_mesh),
-        ("a.ply", mesh.load_points),
+        ("a.ply", samples.load_points),
         ("a.hdr", lighting.load_environment),
         ("a.npz", dataset.load_cloud),
         ("", checkpoint.load_weights),

@@ -20,7 +20,7 @@ from benchmarks import (
     timing,
     train_step,
 )
-from ginn_jax import architecture, image
+from ginn_jax import inference, presets
 from ginn_jax.commandline import hasten
 from ginn_jax.disk_radius import with_disk_radius
 from ginn_jax.errors import InputError
@@ -68,7 +68,7 @@ def test_quick_keeps_what_the_user_gave():
 
 def test_quick_disks_are_those_of_the_default_network():
     for radius in poisson_radii.QUICK["radii"]:
-        with_disk_radius(architecture.DEFAULT, radius)
+        with_disk_radius(presets.DEFAULT, radius)
 
 
 def test_pairs_may_differ_at_the_radius_only():
@@ -108,7 +108,7 @@ def test_neighbors_stops_at_a_search_that_is_wrong(tmp_path, monkeypatch):
 
 def test_train_step(tmp_path, monkeypatch):
     stand_in(monkeypatch)
-    monkeypatch.setitem(architecture.PRESETS, "default", tiny.ONE_LEVEL)
+    monkeypatch.setitem(presets.PRESETS, "default", tiny.ONE_LEVEL)
     limits = tiny.ONE_LEVEL_LIMITS
     monkeypatch.setattr("ginn_jax.fit.training_limits", lambda *_: limits)
     options = train_step.Options(
@@ -279,13 +279,13 @@ def test_mistakes_are_input_errors(tmp_path, monkeypatch):
 
 def stand_in(monkeypatch):
     """Networks that compile in seconds, untrained, with limits that suffice at once."""
-    monkeypatch.setattr(architecture, "DEFAULT", tiny.ONE_LEVEL)
+    monkeypatch.setattr(presets, "DEFAULT", tiny.ONE_LEVEL)
     for module in (f2d, poisson_radii, scaling, train_step):
         monkeypatch.setattr(module, "init_state", untrained)
     for module in (f2d, scaling):
         monkeypatch.setattr(module, "uniform_limits", lambda *_: tiny.ONE_LEVEL_LIMITS)
     # Every frame has full blocks, so one shape is compiled.
-    monkeypatch.setattr(image, "BLOCK", 256)
+    monkeypatch.setattr(inference, "BLOCK", 256)
 
 
 def untrained(config):

@@ -17,7 +17,7 @@ from hypothesis import Phase, given, settings
 from oracles import neighbors
 from strategies import ALL_PAIRS, POINTS, SEEDS, padded
 
-from ginn_jax import hierarchy, image, packets, train
+from ginn_jax import hierarchy, inference, packets, train
 from ginn_jax.limits import Limits
 from ginn_jax.receptive_field import kde_weight
 from ginn_jax.voxels import build_grid
@@ -147,14 +147,14 @@ def one_below(demands):
 
 def counted(monkeypatch, name):
     """What each call of a function of `image` said that it needed."""
-    calls, function = [], getattr(image, name)
+    calls, function = [], getattr(inference, name)
 
     def called(*args, **options):
         result = function(*args, **options)
         calls.append({n: int(d) for n, d in jax.device_get(result[1]).items()})
         return result
 
-    monkeypatch.setattr(image, name, called)
+    monkeypatch.setattr(inference, name, called)
     return calls
 
 
@@ -171,8 +171,12 @@ def test_host_calls_find_room_and_drop_nothing(monkeypatch, caplog):
     )
 
     def run(limits):
-        encoded, found = image.encode_cloud(network, limits, variables, *ends, key=KEY)
-        values, found = image.shade_points(network, found, variables, encoded, *ends)
+        encoded, found = inference.encode_cloud(
+            network, limits, variables, *ends, key=KEY
+        )
+        values, found = inference.shade_points(
+            network, found, variables, encoded, *ends
+        )
         return values, found
 
     expected, _ = run(roomy)
@@ -208,7 +212,7 @@ def test_one_stage_without_room_does_not_swell_the_others(monkeypatch):
 
     def needs(limits):
         given = network, Limits(tuple(limits.items())), variables, *ends
-        return dict(image.encode_cloud(*given, key=KEY)[1].sizes)
+        return dict(inference.encode_cloud(*given, key=KEY)[1].sizes)
 
     assert needs(roomy) == roomy
     need = calls[0]

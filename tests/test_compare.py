@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments import evaluate as experiment
-from ginn_jax import checkpoint, compare_networks, image, scenes
+from ginn_jax import checkpoint, compare_networks, inference, scenes
 from ginn_jax.compare_networks import OURS
 from ginn_jax.compare_report import (
     RIVALS,
@@ -101,7 +101,7 @@ def finished_run(folder, network=tiny.ONE_LEVEL):
 def small_blocks(monkeypatch):
     monkeypatch.setattr(scenes, "ProcessPoolExecutor", tiny.Here)
     # Every picture has full blocks, so one shape is compiled.
-    for module in (image, compare_networks):
+    for module in (inference, compare_networks):
         monkeypatch.setattr(module, "BLOCK", 128)
 
 

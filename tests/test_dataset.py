@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ginn_jax import dataset
-from ginn_jax.architecture import PRESETS
 from ginn_jax.errors import InputError
+from ginn_jax.presets import PRESETS
 
 ORIGIN = {"seed": 3, "radius": 0.1, "object": "shape_3"}
 

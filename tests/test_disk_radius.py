@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import tiny
 
-from ginn_jax.architecture import compact_network
 from ginn_jax.disk_radius import limits_at, with_disk_radius
 from ginn_jax.errors import InputError
-from ginn_jax.image import SLACK
-from ginn_jax.limits import Limits, limits_for
+from ginn_jax.limits import SLACK, Limits, limits_for
+from ginn_jax.presets import compact_network
 
 
 def test_other_disk_radius_changes_the_finest_level_only():

@@ -9,7 +9,7 @@ import pytest
 import tiny
 
 from experiments import animation, environment_maps, latent_features
-from ginn_jax import compare_networks, image, train
+from ginn_jax import compare_networks, inference, train
 from ginn_jax.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("cheap_compiling")
@@ -30,7 +30,7 @@ def untrained(effect):
 @pytest.fixture(autouse=True)
 def tiny_networks(monkeypatch):
     # Every picture has full blocks, so one shape is compiled.
-    monkeypatch.setattr(image, "BLOCK", 128)
+    monkeypatch.setattr(inference, "BLOCK", 128)
     for module in (compare_networks, environment_maps, latent_features):
         monkeypatch.setattr(
             module, "load_pretrained", lambda name: untrained(name.split("_")[0])

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from saved import restore, save_state
 from test_bad_files import ONE_POINT
 
-from ginn_jax import checkpoint, dataset, lighting, lit_clouds, mesh
+from ginn_jax import checkpoint, dataset, lighting, lit_clouds, mesh, samples
 from ginn_jax.errors import InputError, InputWarning
 from ginn_jax.renderer import use_mitsuba
 
@@ -118,7 +118,7 @@ def test_any_mesh_file_is_a_mesh_or_refused(name, data):
 @given(st.data())
 def test_any_point_file_is_points_or_refused(data):
     found = load(
-        mesh.load_points, "points.ply", data.draw(spoiled(written("points.ply")))
+        samples.load_points, "points.ply", data.draw(spoiled(written("points.ply")))
     )
     if found is not None:
         assert np.isfinite(found.position).all()

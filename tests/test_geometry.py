@@ -23,8 +23,10 @@ from small_sphere import (
 
 from ginn_jax import geometry as ge
 from ginn_jax import limits as lm
-from ginn_jax.architecture import Network, released_table
+from ginn_jax import searches as se
+from ginn_jax.architecture import Network
 from ginn_jax.packets import Demand, Edges
+from ginn_jax.presets import released_table
 
 pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
@@ -53,7 +55,7 @@ def pairs(field, receivers):
 def test_every_limit_has_its_demand_and_every_demand_its_limit(built):
     config, _, _, demands = built
     assert (
-        set(demands) == set(ge.limit_names(config)) == set(dict(generous(config).sizes))
+        set(demands) == set(se.limit_names(config)) == set(dict(generous(config).sizes))
     )
 
 
@@ -181,12 +183,12 @@ def test_turned_edges_are_the_same_pairs(drawn):
 
 def test_only_convolutions_between_levels_are_turned():
     config = NETWORKS["surface"]
-    twins = {c.name: ge.transposed(config, c) for c in config.encoder}
+    twins = {c.name: se.transposed(config, c) for c in config.encoder}
     assert twins == {"conv_0": None, "pool_1": "up_1", "conv_1": None, "up_1": None}
     kde = NETWORKS["kde"]
-    assert not any(ge.transposed(kde, c) for c in kde.encoder)
+    assert not any(se.transposed(kde, c) for c in kde.encoder)
     released = Network((0.1,) * 4, released_table(2, (0.1, 0.2, 0.4)), kde.query, 2, 2)
-    twins = {c.name: ge.transposed(released, c) for c in released.encoder}
+    twins = {c.name: se.transposed(released, c) for c in released.encoder}
     # pool_1 reaches half as far as up_1.
     assert {k: v for k, v in twins.items() if v} == {"pool_2": "up_2", "pool_3": "up_3"}
 

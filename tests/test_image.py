@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis.extra.numpy import arrays
 from hypothesis.strategies import floats
 
-from ginn_jax import image
+from ginn_jax import image, inference
 from ginn_jax.errors import InputError
 from ginn_jax.limits import Limits
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
 @pytest.fixture(autouse=True)
 def _small_blocks(monkeypatch):
-    monkeypatch.setattr(image, "BLOCK", 128)
+    monkeypatch.setattr(inference, "BLOCK", 128)
 
 
 @pytest.fixture(scope="module")
@@ -37,13 +37,13 @@ def encoded(variables):
 
 def encode(variables, limits):
     points = tiny.sphere_on_plane(1000, 4)
-    return image.encode_cloud(
+    return inference.encode_cloud(
         tiny.NETWORK, limits, variables, points.position, points.normal, key=KEY
     )
 
 
 def shade(variables, encoded, points, limits=tiny.LIMITS):
-    return image.shade_points(
+    return inference.shade_points(
         tiny.NETWORK, limits, variables, encoded, points.position, points.normal
     )
 
@@ -59,7 +59,7 @@ def values(variables, encoded):
     """At 300 points, in blocks of 128."""
     points = tiny.sphere_on_plane(PIXELS, 5)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(image, "BLOCK", 128)
+        patch.setattr(inference, "BLOCK", 128)
         found, limits = shade(variables, encoded, points)
     assert limits == tiny.LIMITS
     assert found.shape == (PIXELS,)
@@ -68,7 +68,7 @@ def values(variables, encoded):
 
 
 def test_values_do_not_depend_on_blocks(variables, encoded, values, monkeypatch):
-    monkeypatch.setattr(image, "BLOCK", 512)
+    monkeypatch.setattr(inference, "BLOCK", 512)
     found, _ = shade(variables, encoded, tiny.sphere_on_plane(PIXELS, 5))
     np.testing.assert_allclose(found, values, atol=1e-5)
 
@@ -95,7 +95,7 @@ def test_too_small_search_is_raised(variables, encoded, values):
 def test_too_small_geometry_is_raised(variables, encoded, monkeypatch):
     expected = np.array(encoded.points.mask)
     # Raised to the usual limits, which are compiled already.
-    monkeypatch.setattr(image, "SLACK", 1152 / expected.sum())
+    monkeypatch.setattr(inference, "SLACK", 1152 / expected.sum())
     found, limits = encode(variables, with_limits(level_0__points=128))
     assert limits == tiny.LIMITS
     mask = np.array(found.points.mask)
@@ -165,20 +165,20 @@ def test_points_in_order_need_no_sorting(variables, encoded, values):
     points = tiny.sphere_on_plane(PIXELS, 5)
     ends = points.position, points.normal
     arguments = (tiny.NETWORK, tiny.LIMITS, variables, encoded, *ends)
-    found, _ = image.shade_points(*arguments, coherent=True)
+    found, _ = inference.shade_points(*arguments, coherent=True)
     np.testing.assert_allclose(found, values, atol=1e-6)
 
 
 def test_number_of_blocks_is_that_of_the_foreground(
     variables, encoded, values, monkeypatch
 ):
-    calls, shade_block = [], image.shade_block
+    calls, shade_block = [], inference.shade_block
 
     def counted(*arguments, **options):
         calls.append(int(arguments[4].mask.sum()))
         return shade_block(*arguments, **options)
 
-    monkeypatch.setattr(image, "shade_block", counted)
+    monkeypatch.setattr(inference, "shade_block", counted)
     mask = np.arange(24 * 25).reshape(24, 25) >= 300
     arguments = (tiny.NETWORK, tiny.LIMITS, variables, encoded)
     image.shade_image(*arguments, *picture(mask), mask)
@@ -215,14 +215,16 @@ def test_unusable_cloud_is_refused(variables):
     arguments = (tiny.NETWORK, tiny.LIMITS, variables)
     nothing = np.zeros((0, 3), np.float32)
     with pytest.raises(InputError, match=r"^the cloud is empty[^\n]*$"):
-        image.encode_cloud(*arguments, nothing, nothing, key=KEY)
+        inference.encode_cloud(*arguments, nothing, nothing, key=KEY)
     for field in ("position", "normal"):
         for bad in (np.nan, np.inf):
             broken = getattr(points, field).copy()
             broken[7, 1] = bad
             cloud = points._replace(**{field: broken})
             with pytest.raises(InputError, match=r"^[^\n]*non-finite[^\n]*$"):
-                image.encode_cloud(*arguments, cloud.position, cloud.normal, key=KEY)
+                inference.encode_cloud(
+                    *arguments, cloud.position, cloud.normal, key=KEY
+                )
 
 
 def test_openness_lies_between_0_and_1():
@@ -239,7 +241,7 @@ def ground_picture():
 
 
 def test_a_lower_rate_computes_fewer_pixels(variables, encoded, monkeypatch):
-    shaded, shade_points = [], image.shade_points
+    shaded, shade_points = [], inference.shade_points
 
     def counted(*arguments, **options):
         shaded.append(len(arguments[4]))

@@ -3,19 +3,11 @@
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from small_sphere import (
-    CLOUD,
-    QUERIES,
-    SHALLOW,
-    as_jax,
-    as_numpy,
-    demands_of,
-    generous,
-)
+from small_sphere import CLOUD, QUERIES, SHALLOW, as_jax, as_numpy, demands_of, generous
 
-from ginn_jax import geometry as ge
 from ginn_jax import limits as lm
-from ginn_jax.architecture import PRESETS
+from ginn_jax import searches as se
+from ginn_jax.presets import PRESETS
 
 pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
@@ -59,7 +51,7 @@ def test_measured_limits_fit(start, sizes):
         tried.append((i, limits))
         return as_jax(demands_by_hand(sizes[i], limits))
 
-    first = ge.uniform_limits(SHALLOW, start)
+    first = se.uniform_limits(SHALLOW, start)
     limits = lm.measure_limits(first, probe, 2, slack=1.0)
     assert tried[0] == (0, first)
     for i in range(2):
@@ -92,6 +84,6 @@ def test_rounded_capacities_hold_their_count(count):
 
 def test_presets_name_each_limit_once():
     for config in PRESETS.values():
-        names = ge.limit_names(config)
+        names = se.limit_names(config)
         assert len(set(names)) == len(names)
-        assert ge.uniform_limits(config, 5).of(names[-1]) == 5
+        assert se.uniform_limits(config, 5).of(names[-1]) == 5

@@ -11,10 +11,10 @@ import tiny
 from benchmarks import generation
 from benchmarks import relight as relight_benchmark
 from experiments import gi_train, sss_train
-from ginn_jax import architecture, evaluate_light, image, lit_experiment, scenes
+from ginn_jax import evaluate_light, inference, lit_experiment, presets, scenes
 from ginn_jax.errors import InputError
-from ginn_jax.geometry import uniform_limits
 from ginn_jax.lit_clouds import LitCloud
+from ginn_jax.searches import uniform_limits
 from ginn_jax.shading import Encoded
 
 SMALL = {
@@ -28,8 +28,8 @@ SMALL = {
     "quick": True,
 }
 EFFECTS = {
-    "gi": (gi_train, architecture.ILLUMINATION, {"materials": 1}),
-    "sss": (sss_train, architecture.SCATTERING, {"materials": 3, "asks": "all"}),
+    "gi": (gi_train, presets.ILLUMINATION, {"materials": 1}),
+    "sss": (sss_train, presets.SCATTERING, {"materials": 3, "asks": "all"}),
 }
 
 
@@ -38,7 +38,7 @@ def test_a_small_run_leaves_all_that_is_promised(effect, tmp_path, monkeypatch):
     script, table, more = EFFECTS[effect]
     network = replace(tiny.ONE_LEVEL, lights=1, **more)
     monkeypatch.setitem(table, "homogeneous", network)
-    monkeypatch.setattr(image, "BLOCK", 128)
+    monkeypatch.setattr(inference, "BLOCK", 128)
     # Workers are tested with the scenes.
     monkeypatch.setattr(scenes, "ProcessPoolExecutor", tiny.Here)
     # That they are measured is tested where occlusion is.
@@ -157,7 +157,7 @@ def test_relight_benchmark(tmp_path, monkeypatch):
         repeats=1,
         networks=("illumination, linear",),
     )
-    monkeypatch.setattr(image, "BLOCK", 128)
+    monkeypatch.setattr(inference, "BLOCK", 128)
     with tiny.cheap_compiling():
         metrics = relight_benchmark.main(options)
     [row] = metrics["rows"]

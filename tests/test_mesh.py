@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from triangles import CORNERS, clear_cut, cube, heron, soup
 
 from ginn_jax import mesh as gm
+from ginn_jax import samples as gs
 
 
 @given(CORNERS, st.lists(st.integers(0, 11), max_size=5))
@@ -45,10 +46,10 @@ def test_unit_box_has_longest_side_one_and_is_idempotent(corners):
     np.testing.assert_allclose(low, -high, atol=1e-6)
     again = gm.fit_unit_box(mesh)
     np.testing.assert_allclose(again.vertices, mesh.vertices, atol=1e-6)
-    cloud = gm.Samples(
+    cloud = gs.Samples(
         mesh.vertices * 3 + 1, mesh.vertices, np.zeros(len(mesh.vertices))
     )
-    fitted = gm.fit_unit_box_points(cloud)
+    fitted = gs.fit_unit_box_points(cloud)
     np.testing.assert_allclose(fitted.position, mesh.vertices, atol=1e-5)
     np.testing.assert_array_equal(fitted.normal, cloud.normal)
 

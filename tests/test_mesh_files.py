@@ -8,6 +8,7 @@ import trimesh
 from triangles import signed_volume
 
 from ginn_jax import mesh as gm
+from ginn_jax import samples as gs
 from ginn_jax.errors import InputWarning
 
 ASSETS = Path(__file__).parents[2] / "shared" / "assets" / "meshes"
@@ -50,6 +51,6 @@ def test_folders_are_searched_and_sorted(tmp_path):
 def test_real_meshes_load_and_sample():
     for path in gm.find_meshes(ASSETS)[::20]:
         mesh = gm.fit_unit_box(gm.load_mesh(path))
-        samples = gm.sample_surface(gm.add_ground(mesh), 2000, seed=0)
+        samples = gs.sample_surface(gm.add_ground(mesh), 2000, seed=0)
         assert np.isfinite(samples.position).all()
         assert set(samples.material) == {0, 1}

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 import tiny
 
-from ginn_jax import train
-from ginn_jax.architecture import RELEASED, Conv, Network, compact_network
+from ginn_jax import objective
+from ginn_jax.architecture import Conv, Network
 from ginn_jax.example import Asked, Example
-from ginn_jax.geometry import build_geometry, build_query_field, limit_names
+from ginn_jax.geometry import build_geometry, build_query_field
 from ginn_jax.limits import Limits, fits
+from ginn_jax.presets import RELEASED, compact_network
 from ginn_jax.receptive_field import Oriented
+from ginn_jax.searches import limit_names
 
 # The paper's kernels, batch norm, density and every kind of layer, in two levels.
 SMALL_PAPER = Network(
@@ -111,7 +113,7 @@ def example_of(network, factor):
 @cache
 def initial(network):
     example = example_of(network, 1)(cloud(), queries())
-    init = jax.jit(partial(train.init_variables, network))
+    init = jax.jit(partial(objective.init_variables, network))
     return init(example, key=jax.random.key(5))
 
 
@@ -121,7 +123,7 @@ def predictor(network):
 
     @jax.jit
     def predict(variables, example):
-        return train.infer(network, variables, example)[0]
+        return objective.infer(network, variables, example)[0]
 
     return lambda example: np.array(predict(initial(network), example))
 
@@ -129,8 +131,8 @@ def predictor(network):
 @cache
 def gradient_of(network):
     """Loss, moments and gradient in training, one compilation per shape."""
-    params, moments = train.split_variables(initial(network))
-    value = jax.value_and_grad(train.batch_loss, has_aux=True)
+    params, moments = objective.split_variables(initial(network))
+    value = jax.value_and_grad(objective.batch_loss, has_aux=True)
     compiled = jax.jit(lambda example: value(params, moments, network, example))
     return compiled
 
@@ -153,7 +155,7 @@ def test_gradient_reaches_every_parameter_of_the_papers_layers():
         kind for kind in ("BatchNorm", "w1", "b3", "Dense") for n in named if kind in n
     }
     assert len(kinds) == 4
-    _, before = train.split_variables(initial(SMALL_PAPER))
+    _, before = objective.split_variables(initial(SMALL_PAPER))
     for old, new in zip(jax.tree.leaves(before), jax.tree.leaves(moments), strict=True):
         assert np.isfinite(new).all()
         assert not np.array_equal(old, new)

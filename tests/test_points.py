@@ -10,6 +10,7 @@ from hypothesis.extra import numpy as hnp
 from triangles import COORDINATE, CORNERS, clear_cut, cube, heron, soup
 
 from ginn_jax import mesh as gm
+from ginn_jax import samples as gs
 
 
 @given(CORNERS, st.integers(0, 2**32))
@@ -20,7 +21,7 @@ def test_samples_lie_on_their_triangles(corners, seed):
         warnings.simplefilter("ignore")
         # The material tells which triangle a sample is from.
         mesh = gm.make_mesh(*soup(corners), np.arange(len(corners)))
-    samples = gm.sample_surface(mesh, 64, seed=seed)
+    samples = gs.sample_surface(mesh, 64, seed=seed)
     a, b, c = np.moveaxis(
         mesh.vertices[mesh.faces].astype(float)[samples.material], 1, 0
     )
@@ -32,7 +33,7 @@ def test_samples_lie_on_their_triangles(corners, seed):
     for edge in (b - a, c - a):
         assert np.abs((samples.normal * edge).sum(-1)).max() < 1e-4
     assert (np.linalg.det(basis) > 0).all()
-    same = gm.sample_surface(mesh, 64, seed=seed)
+    same = gs.sample_surface(mesh, 64, seed=seed)
     np.testing.assert_array_equal(samples.position, same.position)
 
 
@@ -45,7 +46,7 @@ def test_samples_are_uniform_by_area(corners):
         warnings.simplefilter("ignore")
         mesh = gm.make_mesh(*soup(corners), np.arange(len(corners)))
     count, share = 20_000, heron(corners) / heron(corners).sum()
-    samples = gm.sample_surface(mesh, count, seed=7)
+    samples = gs.sample_surface(mesh, count, seed=7)
     found = np.bincount(samples.material, minlength=len(corners))
     deviation = np.sqrt(count * share * (1 - share))
     assert (np.abs(found - count * share) <= 6 * deviation + 1).all()
@@ -56,8 +57,8 @@ def test_samples_are_uniform_by_area(corners):
 
 def test_ground_samples_match_the_density_of_the_cloud():
     mesh = gm.make_mesh(*cube())
-    cloud = gm.sample_surface(mesh, 6000, seed=1)  # 1000 a unit of area
-    both = gm.add_ground_samples(cloud, 0.8, seed=2)
+    cloud = gs.sample_surface(mesh, 6000, seed=1)  # 1000 a unit of area
+    both = gs.add_ground_samples(cloud, 0.8, seed=2)
     ground = both.position[both.material == 1]
     assert len(ground) == pytest.approx(1000 * 1.6**2, rel=0.2)
     np.testing.assert_array_equal(
@@ -84,7 +85,7 @@ def write_points(path, rows, names=("x", "y", "z", "nx", "ny", "nz")):
 def test_point_clouds_load_with_unit_normals(tmp_path_factory, rows):
     assume((np.linalg.norm(rows[:, 3:].astype(float), axis=1) > 1e-3).all())
     path = write_points(tmp_path_factory.mktemp("points") / "cloud.ply", rows)
-    samples = gm.load_points(path)
+    samples = gs.load_points(path)
     np.testing.assert_allclose(samples.position, rows[:, :3], rtol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(samples.normal, axis=1), 1, atol=1e-5)
     assert ((samples.normal * rows[:, 3:]).sum(1) > 0).all()

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import tiny
 
-from ginn_jax import image, train
-from ginn_jax.architecture import only_2d, only_3d
-from ginn_jax.geometry import limit_names, uniform_limits
+from ginn_jax import inference, train
 from ginn_jax.lit_clouds import LitCloud, network_numbers
+from ginn_jax.presets import only_2d, only_3d
 from ginn_jax.relight import prepare_relighting, relight
+from ginn_jax.searches import limit_names, uniform_limits
 
 KEY = jax.random.key(1)
 MEDIUM = replace(tiny.ONE_LEVEL, materials=3, lights=1, asks="all")
@@ -35,7 +35,7 @@ pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
 @pytest.fixture(autouse=True)
 def _small_blocks(monkeypatch):
-    monkeypatch.setattr(image, "BLOCK", 512)
+    monkeypatch.setattr(inference, "BLOCK", 512)
 
 
 def limits_of(network):
@@ -67,10 +67,12 @@ def case(request):
 
 def shade(network, variables, cloud, queries):
     ends = variables, cloud.position, cloud.normal, *network_numbers(cloud)
-    encoded, limits = image.encode_cloud(network, limits_of(network), *ends, key=KEY)
+    encoded, limits = inference.encode_cloud(
+        network, limits_of(network), *ends, key=KEY
+    )
     ends = variables, encoded, queries.position, queries.normal
     numbers = network_numbers(queries)
-    return image.shade_points(network, limits, *ends, *numbers)[0]
+    return inference.shade_points(network, limits, *ends, *numbers)[0]
 
 
 def scaled(cloud, factor):

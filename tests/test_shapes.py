@@ -8,7 +8,8 @@ from hypothesis.extra import numpy as hnp
 
 from experiments.shape_sheet import contact_sheet
 from ginn_jax import clad_shapes, reference, sdf, shapes, solids
-from ginn_jax.mesh import add_ground, make_mesh, sample_surface
+from ginn_jax.mesh import add_ground, make_mesh
+from ginn_jax.samples import sample_surface
 
 SEED = st.integers(0, 2**31 - 1)
 

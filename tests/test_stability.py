@@ -10,7 +10,7 @@ import tiny
 import trimesh
 
 from benchmarks import stability, stability_cases, stability_stages
-from ginn_jax import dataset, hierarchy, image, irradiance, train
+from ginn_jax import dataset, hierarchy, inference, irradiance, train
 from ginn_jax.dataset import unit_light
 from ginn_jax.errors import InputError
 from ginn_jax.lighting import PointLight
@@ -86,8 +86,10 @@ def shaded(position, offset=0.0):
     with tiny.cheap_compiling():
         network, limits = tiny.ONE_LEVEL, tiny.ONE_LEVEL_LIMITS
         ends = position + offset, CLOUD.normal
-        encoded, limits = image.encode_cloud(network, limits, weights(), *ends, key=KEY)
-        return image.shade_points(network, limits, weights(), encoded, *ends)[0]
+        encoded, limits = inference.encode_cloud(
+            network, limits, weights(), *ends, key=KEY
+        )
+        return inference.shade_points(network, limits, weights(), encoded, *ends)[0]
 
 
 @pytest.mark.parametrize("offset", [1e3, 1e4, 1e6])

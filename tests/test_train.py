@@ -14,7 +14,7 @@ import optax
 import pytest
 import tiny
 
-from ginn_jax import example, train
+from ginn_jax import example, objective, train
 from ginn_jax.geometry import Geometry
 from ginn_jax.limits import exceeded
 from ginn_jax.receptive_field import Oriented
@@ -51,7 +51,7 @@ def test_gradient_reaches_every_parameter():
     first_moments = optax.tree.get(state.optimizer, "mu")
     leaves = jax.tree_util.tree_leaves_with_path(first_moments)
     dead = [jax.tree_util.keystr(path) for path, leaf in leaves if not np.any(leaf)]
-    params, _ = train.split_variables(state.variables)
+    params, _ = objective.split_variables(state.variables)
     assert len(leaves) == len(jax.tree.leaves(params)) > 40
     assert dead == []
     assert report.gradient_norm > 0

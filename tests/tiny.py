@@ -11,10 +11,10 @@ import jax
 import numpy as np
 
 from ginn_jax import train
-from ginn_jax.architecture import compact_network
 from ginn_jax.dataset import ShadedPoints, stack_clouds
-from ginn_jax.geometry import limit_names, uniform_limits
 from ginn_jax.limits import Limits
+from ginn_jax.presets import compact_network
+from ginn_jax.searches import limit_names, uniform_limits
 
 NETWORK = compact_network(k=4, levels=(0.08, 0.2), query_radius=0.16, latent=4)
 CONFIG = train.Training(
