@@ -191,9 +191,12 @@ def relight(
     rows = bucket(len(cloud.position))
     numbers = (pad_channels(a, rows) for a in network_numbers(cloud))
     lit = _encode_planned(network, variables, ready.scene, *numbers)
-    copies = [jax.device_put((variables, lit), device) for device in jax.devices()]
+    needed = {"shader": variables["shader"]}, lit
+    copies = [jax.device_put(needed, device) for device in jax.devices()]
     size, parts = block_size(len(queries.position), lit=True), []
-    asked = numbers_asked(network, *network_numbers(queries))
+    asked = (None, None)
+    if network.asks == "all":
+        asked = network_numbers(queries)
     for number, plan in enumerate(ready.blocks):
         part = slice(number * size, (number + 1) * size)
         own = (None if a is None else pad_channels(a[:, part], size) for a in asked)
