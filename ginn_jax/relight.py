@@ -23,7 +23,7 @@ from ginn_jax.neighbors import bucket, pad_rows
 from ginn_jax.network import STORED, Code, Variables
 from ginn_jax.process import ALONE
 from ginn_jax.receptive_field import Field, Oriented, in_coherent_order
-from ginn_jax.shading import encode_channels, numbers_asked, shade_channels
+from ginn_jax.shading import encode_channels, shade_channels
 
 
 class ScenePlan(NamedTuple):

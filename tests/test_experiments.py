@@ -31,7 +31,7 @@ KEYS = (
 )
 SMALL = ao_train.Options(
     shapes=2,
-    test_shapes=3,
+    test_shapes=2,
     rays=8,
     points=1000,
     steps=2,
@@ -91,7 +91,7 @@ def test_a_small_run_leaves_all_that_is_promised(tmp_path, monkeypatch):
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert not [key for key in KEYS if key not in metrics]
     assert metrics["steps"] == 2
-    assert len(metrics["unseen_shapes"]) == 3
+    assert len(metrics["unseen_shapes"]) == 2
     rays = [r["mse_2d"] for r in metrics["error_against_time"] if "rays" in r]
     assert rays == sorted(rays, reverse=True)
     for name in ("learning_curve", "views", "error_against_time"):
