@@ -16,14 +16,17 @@ from ginn_jax.searches import limit_names, uniform_limits
 KEY = jax.random.key(1)
 MEDIUM = replace(tiny.ONE_LEVEL, materials=3, lights=1, asks="all")
 LOCAL = replace(MEDIUM, local=True)
-# Pooling and its way back once: others differ in what one level shows as well.
+# Pooling and its way back once for what is linear, and once for what is not: where
+# nothing but f_3D can be nonlinear.
 EFFECTS = {
     "illumination": replace(tiny.NETWORK, linear=True, materials=1, lights=1),
     "scattering": replace(MEDIUM, linear=True),
     "homogeneous": replace(tiny.ONE_LEVEL, materials=1, lights=1),
     "local": LOCAL,
     "only_2d": only_2d(LOCAL),
-    "only_3d": only_3d(LOCAL),
+    "only_3d": only_3d(
+        replace(tiny.NETWORK, materials=3, lights=1, asks="all", local=True)
+    ),
 }
 
 
