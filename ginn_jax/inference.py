@@ -68,9 +68,7 @@ def encode_cloud(
     check_numbers("light", light, network.lights, len(position))
     rows = bucket(len(position))
     center = center_of(position)
-    padded, mask = pad_rows(relative_to(center, position), rows)
-    turned, _ = pad_rows(np.asarray(normal, np.float32), rows)
-    cloud = Oriented(padded, turned, mask)
+    cloud = pad_points(center, position, normal, rows)
     more = pad_channels(material, rows), pad_channels(light, rows)
 
     def attempt(limits: Limits) -> tuple[Encoded, list[Demands]]:
@@ -105,6 +103,18 @@ def check_numbers(name: str, numbers: Any, width: int, rows: int) -> None:
         raise InputError(f"{name} is {shape}, the network takes [C {rows} {width}]")
     if width and not np.isfinite(given).all():
         raise InputError(f"{name} holds non-finite numbers: remove those points")
+
+
+def pad_points(
+    center: Float[np.ndarray, "3"] | None,
+    position: Float[np.ndarray, "N 3"],
+    normal: Float[np.ndarray, "N 3"],
+    rows: int,
+) -> Oriented:
+    """Points counted from `center`, and padding up to `rows`."""
+    place, mask = pad_rows(relative_to(center, position), rows)
+    turned, _ = pad_rows(np.asarray(normal, np.float32), rows)
+    return Oriented(place, turned, mask)
 
 
 def pad_channels(
@@ -161,9 +171,7 @@ def shade_points(
     copies = [jax.device_put(needed, device) for device in jax.devices()]
     size = block_size(len(position), encoded.scale is not None)
     rows = -(-len(position) // size) * size
-    place, mask = pad_rows(relative_to(center, position), rows)
-    turned, _ = pad_rows(np.asarray(normal, np.float32), rows)
-    whole = Oriented(place, turned, mask)
+    whole = pad_points(center, position, normal, rows)
     asked = numbers_asked(network, material, light)
     numbers = tuple(pad_channels(a, rows) for a in asked)
 

@@ -57,7 +57,7 @@ displayed, after the paper's tone mapping, over the foreground.
 {report.table_of(m["error_against_time"], times)}
 ![error against run time](error_against_time.png)
 
-![reference and network, displayed](views.png)
+![reference and network](views.png)
 
 ## Training
 

@@ -13,13 +13,20 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ginn_jax.architecture import Network
 from ginn_jax.checks import unit_rows
-from ginn_jax.dataset import center_of, relative_to
+from ginn_jax.dataset import center_of
 from ginn_jax.geometry import Geometry, build_geometry, build_query_field
-from ginn_jax.inference import block_size, cloud_limits, only, pad_channels, without
+from ginn_jax.inference import (
+    block_size,
+    cloud_limits,
+    only,
+    pad_channels,
+    pad_points,
+    without,
+)
 from ginn_jax.limits import Demands, Limits, say_raised, with_room
 from ginn_jax.lit_clouds import LitCloud, network_numbers
 from ginn_jax.mcconv import stored_kernel
-from ginn_jax.neighbors import bucket, pad_rows
+from ginn_jax.neighbors import bucket
 from ginn_jax.network import STORED, Code, Variables
 from ginn_jax.process import ALONE
 from ginn_jax.receptive_field import Field, Oriented, in_coherent_order
@@ -140,7 +147,8 @@ def prepare_relighting(
     unit_rows(cloud.position, cloud.normal, "the cloud")
     unit_rows(queries.position, queries.normal, "queries")
     center = center_of(cloud.position)
-    points = _padded(cloud, center, slice(None), bucket(len(cloud.position)))
+    rows = bucket(len(cloud.position))
+    points = pad_points(center, cloud.position, cloud.normal, rows)
     size = block_size(len(queries.position), lit=True)
 
     def plan_points(limits: Limits) -> tuple[ScenePlan, list[Demands]]:
@@ -155,7 +163,9 @@ def prepare_relighting(
         flat = only(limits, network.query.name)
         blocks, demands = [], []
         for number, first in enumerate(range(0, len(queries.position), size)):
-            block = _padded(queries, center, slice(first, first + size), size)
+            part = slice(first, first + size)
+            ends = queries.position[part], queries.normal[part]
+            block = pad_points(center, *ends, size)
             ends = scene.geometry, block
             plan, demand = _plan_queries(network, flat, variables, *ends)
             device = jax.devices()[number % len(jax.devices())]
@@ -166,15 +176,6 @@ def prepare_relighting(
     blocks, sufficed = with_room(sufficed, plan_blocks)
     say_raised(limits, sufficed)
     return Relightable(scene, tuple(blocks)), sufficed
-
-
-def _padded(
-    cloud: LitCloud, center: Float[np.ndarray, "3"], rows: slice, size: int
-) -> Oriented:
-    """Some rows of a cloud, counted from `center`, padded to `size`."""
-    position, mask = pad_rows(relative_to(center, cloud.position[rows]), size)
-    normal, _ = pad_rows(np.asarray(cloud.normal[rows], np.float32), size)
-    return Oriented(position, normal, mask)
 
 
 def relight(
@@ -194,9 +195,7 @@ def relight(
     needed = {"shader": variables["shader"]}, lit
     copies = [jax.device_put(needed, device) for device in jax.devices()]
     size, parts = block_size(len(queries.position), lit=True), []
-    asked = (None, None)
-    if network.asks == "all":
-        asked = network_numbers(queries)
+    asked = network_numbers(queries) if network.asks == "all" else (None, None)
     for number, plan in enumerate(ready.blocks):
         part = slice(number * size, (number + 1) * size)
         own = (None if a is None else pad_channels(a[:, part], size) for a in asked)
