@@ -89,7 +89,7 @@ def main(options: Options) -> dict[str, Any]:
     network = presets.PRESETS[options.preset]
     config = training(options, network, options.points, len(clouds))
     extra = {"data": asdict(settings), "objects": [s.name for s in train_sources]}
-    run = train(console, config, clouds, options.out, options.resume, extra)
+    run = train(console, config, clouds, options, extra)
     clock.parts |= run.seconds
 
     begin = time.perf_counter()

@@ -22,6 +22,7 @@ from ginn_jax.dataset import count_asked, count_given
 from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import Cloud
 from ginn_jax.objects import SEEDS_APART, UNSEEN_SEED, Source
+from ginn_jax.pretrained import load_any, starting_weights
 from ginn_jax.process import available_cores
 from ginn_jax.train import Training
 
@@ -56,6 +57,8 @@ class RunOptions:
     """Shade the evaluation images at this share of their resolution too; 1: do not."""
     seed: int = 0
     """Seed of everything."""
+    start: str | None = None
+    """Weights to train on: the folder of a run, or a name as "ao" or "gi_only_2d"."""
     resume: bool = False
     """Go on where a killed run with the same options was."""
     quick: bool = False
@@ -71,6 +74,8 @@ def check_run(options: RunOptions, least: dict[str, int]) -> None:
             f"--resolution-scale is {options.resolution_scale}: give it in (0, 1]"
         )
     require_positive(options, "learning_rate")
+    if options.start is not None:
+        load_any(options.start)  # a name that is wrong is said before data are made
     if max(options.shapes, 30) + options.seed * SEEDS_APART > UNSEEN_SEED:
         raise InputError(
             f"--seed {options.seed} with {options.shapes} shapes would train on those "
@@ -121,17 +126,22 @@ def train(
     console: Console,
     config: Training,
     clouds: Sequence[Cloud],
-    out: Path,
-    resume: bool,
+    options: RunOptions,
     extra: dict[str, Any],
 ) -> fit.Fit:
     """`fit.fit` with a progress bar, or a line every 100 steps where none can be.
 
-    What was reported of an earlier run in `out` is removed: it is of other weights.
+    What was reported of an earlier run there is removed: it is of other weights.
+
+    Raises:
+        InputError: as `fit.fit`; weights to start from that are of another network.
     """
-    begin = time.perf_counter()
+    begin, weights = time.perf_counter(), None
+    if options.start is not None:
+        weights = starting_weights(options.start, config)
+        extra = extra | {"start": options.start}
     for name in report.RESULTS:
-        (out / name).unlink(missing_ok=True)
+        (options.out / name).unlink(missing_ok=True)
     with bar(console) as progress:
         task = progress.add_task("training", total=config.steps, note="compiling")
 
@@ -142,7 +152,8 @@ def train(
             if not console.is_terminal and (note or step % 100 == 0):
                 console.print(f"step {step} of {config.steps}: {text}")
 
-        return fit.fit(config, clouds, out, fit.Schedule(), tell, resume, extra)
+        given = config, clouds, options.out, fit.Schedule(), tell, options.resume
+        return fit.fit(*given, extra, weights)
 
 
 def training(

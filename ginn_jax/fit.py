@@ -24,6 +24,7 @@ from ginn_jax.errors import InputError
 from ginn_jax.files import writing
 from ginn_jax.limits import SLACK, Limits, exceeded, measure_limits, widened
 from ginn_jax.lit_clouds import Cloud, channel_of
+from ginn_jax.network import Variables
 from ginn_jax.searches import uniform_limits
 from ginn_jax.train import (
     Training,
@@ -70,8 +71,9 @@ def fit(
     progress: Progress,
     resume: bool = False,
     extra: dict[str, Any] | None = None,
+    weights: Variables | None = None,
 ) -> Fit:
-    """Train to `config.steps`, saving under `folder`.
+    """Train to `config.steps` from `weights` or random ones, saving under `folder`.
 
     Where a batch needs more than a limit the limit is raised and the step repeated, on
     the state it started from. `progress(step, loss, note)` hears of every report.
@@ -88,7 +90,11 @@ def fit(
         limits, seconds = training_limits(config, clouds), dict(UNSPENT)
         save_run(folder, config, limits, extra, seconds)
     manager = open_manager(folder, fresh=not resume)
-    state, history, raised = init_state(config), list[float](), dict[str, int]()
+    state, history, raised = (
+        init_state(config, weights),
+        list[float](),
+        dict[str, int](),
+    )
     if resume and (found := restore_state(manager, state)) is not None:
         state, history = found, load_losses(folder, int(found.step)).tolist()
     seconds["compile"] += time.perf_counter() - start

@@ -101,7 +101,7 @@ def run_experiment(
 
     config = training(options, network, settings.points, len(clouds))
     extra = {"data": asdict(settings), "objects": [s.name for s in seen]}
-    run = train(console, config, clouds, options.out, options.resume, extra)
+    run = train(console, config, clouds, options, extra)
     clock.parts |= run.seconds
 
     begin = time.perf_counter()

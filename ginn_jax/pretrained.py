@@ -65,6 +65,27 @@ def load_pretrained(
     return config, limits, read_weights(folder / f"{name}.npz", config)
 
 
+def starting_weights(name: str, config: Training) -> Variables:
+    """Weights to train on: of a run, if `name` is its folder, or of the package.
+
+    Raises:
+        InputError: none of that name, or of a network with other layers.
+    """
+    _, _, weights = load_any(name)
+    found, wanted = jax.eval_shape(lambda: weights), state_shapes(config).variables
+    if jax.tree.map(str, found) != jax.tree.map(str, wanted):
+        raise InputError(
+            f"{name} holds a network with other layers: train on one of this --preset"
+        )
+    return weights
+
+
+def load_any(name: str) -> tuple[Training, Limits, Variables]:
+    """`load_weights` of the folder of a run, else `load_pretrained`."""
+    run = Path(name)
+    return load_weights(run) if run.is_dir() else load_pretrained(name)
+
+
 def read_weights(path: Path, config: Training) -> Variables:
     """The weights of a network from their file.
 

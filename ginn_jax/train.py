@@ -163,12 +163,14 @@ def make_example(
     return thin_and_search(config.network, limits, batch, *sizes, key=key)
 
 
-def init_state(config: Training) -> TrainState:
-    """The state before the first step."""
-    zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), _example_shapes(config))
-    key = jax.random.key(config.seed)
-    variables = jax.jit(partial(init_variables, config.network))(zeros, key=key)
-    return place(config, _first_state(config, variables))
+def init_state(config: Training, variables: Variables | None = None) -> TrainState:
+    """The state before the first step, of these weights or, by default, random ones."""
+    if variables is None:
+        shapes, key = _example_shapes(config), jax.random.key(config.seed)
+        zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+        variables = jax.jit(partial(init_variables, config.network))(zeros, key=key)
+    # A step gives its state's memory away: not that of whoever gave the weights.
+    return place(config, _first_state(config, jax.tree.map(jnp.array, variables)))
 
 
 def state_shapes(config: Training) -> TrainState:

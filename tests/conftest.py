@@ -2,6 +2,9 @@
 
 import os
 
+# XLA says of every compiled function that it finds in the cache that it may not fit.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
 import jax
 import pytest
 from hypothesis import settings

@@ -41,11 +41,11 @@ def exported(tmp_path_factory):
     metrics = pooled | {"steps": 0, "environment": {"packages": {}}}
     (run / "metrics.json").write_text(json.dumps(metrics))
     pretrained.export(run, "ao", {"command": "none"}, folder)
-    return folder, state
+    return folder, state, run
 
 
 def test_weights_come_back_bit_for_bit(exported):
-    folder, state = exported
+    folder, state, _ = exported
     config, limits, weights = pretrained.load_pretrained("ao", folder)
     assert (config, dict(limits.sizes)) == (tiny.CONFIG, dict(tiny.LIMITS.sizes))
     assert tiny.identical(weights, jax.device_get(state.variables))
@@ -53,7 +53,7 @@ def test_weights_come_back_bit_for_bit(exported):
 
 
 def test_unknown_names_and_damaged_files_are_told(exported, tmp_path):
-    folder, _ = exported
+    folder, *_ = exported
     with pytest.raises(InputError, match=r"'water'.*there are ao"):
         pretrained.load_pretrained("water", folder)
     with pytest.raises(InputError, match="there are none"):
@@ -72,7 +72,7 @@ def test_unknown_names_and_damaged_files_are_told(exported, tmp_path):
 
 
 def test_weights_of_another_network_or_not_finite_are_refused(exported, tmp_path):
-    folder, _ = exported
+    folder, *_ = exported
     with np.load(folder / "ao.npz") as file:
         arrays = dict(file)
     name = next(n for n in arrays if n != "origin")
@@ -85,6 +85,18 @@ def test_weights_of_another_network_or_not_finite_are_refused(exported, tmp_path
     np.savez(tmp_path / "ao.npz", **(arrays | {name: np.nan * arrays[name]}))
     with pytest.raises(InputError, match="not finite"):
         pretrained.load_pretrained("ao", tmp_path)
+
+
+def test_training_starts_from_a_run_or_from_the_package(exported):
+    _, state, run = exported
+    found = pretrained.starting_weights(str(run), tiny.CONFIG)
+    assert tiny.identical(found, jax.device_get(state.variables))
+    config, _, weights = shipped("ao_only_2d")
+    assert tiny.identical(pretrained.starting_weights("ao_only_2d", config), weights)
+    with pytest.raises(InputError, match="other layers"):
+        pretrained.starting_weights(str(run), config)
+    with pytest.raises(InputError, match=r"'a0'.*there are ao"):
+        pretrained.starting_weights("a0", config)
 
 
 def test_manifest_has_every_network_and_no_other():

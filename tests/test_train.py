@@ -46,6 +46,15 @@ def test_tiny_scene_is_overfitted(trained):
     assert state.skipped == 0
 
 
+def test_training_goes_on_from_given_weights(trained):
+    given = jax.tree.map(jnp.asarray, trained[0].variables)
+    state = train.init_state(tiny.CONFIG, given)
+    assert (state.step, state.skipped) == (0, 0)
+    _, [report] = run(state, 1)
+    assert report.loss < 0.2 * trained[1][0]
+    assert tiny.identical(given, trained[0].variables)
+
+
 def test_gradient_reaches_every_parameter():
     state, [report] = run(tiny.fresh_state(), 1)
     first_moments = optax.tree.get(state.optimizer, "mu")

@@ -21,6 +21,7 @@ import tiny
 
 from ginn_jax import checkpoint, dataset, fit
 from ginn_jax.errors import InputError
+from ginn_jax.train import state_shapes
 
 POINTS = 200
 LIT = replace(tiny.ONE_LEVEL, lights=1, local=True)
@@ -48,9 +49,19 @@ def stressful():
     return [cloud(0), cloud(1, sun), heap, cloud(3, 0.0), far, nan]
 
 
-def train(folder, clouds, resume=False, progress=lambda *_: None):
+def train(folder, clouds, resume=False, progress=lambda *_: None, weights=None):
+    given = CONFIG, clouds, folder, OFTEN, progress, resume
     with tiny.cheap_compiling(), jax.numpy_dtype_promotion("standard"):
-        return fit.fit(CONFIG, clouds, folder, OFTEN, progress, resume)
+        return fit.fit(*given, weights=weights)
+
+
+def test_weights_that_are_given_are_trained_on(tmp_path):
+    shapes = state_shapes(CONFIG).variables
+    zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
+    found = train(tmp_path, [cloud(0)], weights=zeros).state.variables
+    # From nothing but zeros only the last bias has a gradient.
+    changed = [bool(np.any(leaf)) for leaf in jax.tree.leaves(found)]
+    assert sum(changed) == 1
 
 
 def assert_finite(tree):
