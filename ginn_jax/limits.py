@@ -22,6 +22,8 @@ Demands = dict[str, Int[Any, ""]]
 Made = TypeVar("Made")
 # What is made room for beyond what was needed.
 SLACK = 1.25
+# Fewer probes than these take less time than compiling them for tighter limits does.
+FEW = 8
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,8 @@ def measure_limits(
     """Host: limits that hold the demands of `count` probes, with slack.
 
     `probe(limits, i)` builds the geometry of example i. `limits` should be generous:
-    the first example is probed with them, the others with twice what the first needed.
+    the first example is probed with them, the others, unless they are `FEW`, with twice
+    what the first needed.
     """
     largest: dict[str, int] = {}
     for i in range(count):
@@ -135,7 +138,7 @@ def measure_limits(
             demands = probe(limits, i)
         for name, demand in demands.items():
             largest[name] = max(largest.get(name, 0), int(np.max(demand)))
-        if i == 0:
+        if i == 0 and count > FEW:
             limits = limits_for(largest, 2.0)
     return limits_for(largest, slack)
 

@@ -5,7 +5,7 @@ convolves, differentiates and updates. A batch is shared out between the devices
 """
 
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -190,6 +190,7 @@ def _first_state(config: Training, variables: Variables) -> TrainState:
     return TrainState(variables, optimizer, jnp.int32(0), jnp.int32(0))
 
 
+@cache
 def _example_shapes(config: Training) -> Example:
     """Shapes of what a step computes from the clouds, in the smallest capacities."""
     limits = uniform_limits(config.network, 64)

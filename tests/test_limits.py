@@ -41,8 +41,10 @@ def test_limits_that_are_too_small_are_named(shallow, names):
     assert lm.exceeded(limits, demands) == {name: shallow[name] for name in names}
 
 
-@pytest.mark.parametrize("start", [100, 1 << 14])
-@pytest.mark.parametrize("sizes", [(700, 1000), (1000, 700), (5, 4000)])
+@pytest.mark.parametrize("start", [100, 1 << 19])
+@pytest.mark.parametrize(
+    "sizes", [(700, 1000), (1000, 700), (5, 4000), (700,) * 10 + (1000,)]
+)
 def test_measured_limits_fit(start, sizes):
     """From limits that are too small, and from generous ones."""
     tried = []
@@ -52,9 +54,12 @@ def test_measured_limits_fit(start, sizes):
         return as_jax(demands_by_hand(sizes[i], limits))
 
     first = se.uniform_limits(SHALLOW, start)
-    limits = lm.measure_limits(first, probe, 2, slack=1.0)
+    limits = lm.measure_limits(first, probe, len(sizes), slack=1.0)
     assert tried[0] == (0, first)
-    for i in range(2):
+    if start > 100:
+        shapes = {limits for _, limits in tried}
+        assert len(shapes) == (1 if len(sizes) <= lm.FEW else 2)
+    for i in range(len(sizes)):
         assert lm.exceeded(limits, probe(limits, i)) == {}
 
 
