@@ -43,6 +43,12 @@ class Options:
     """Ambient occlusion, global illumination or subsurface scattering."""
     out: Path = Path("runs/animation")
     """Folder for metrics.json, report.md, the strip and the moving image."""
+    checkpoint: Path | None = None
+    """The --out of a training run; left out, the weights that come with the package."""
+    only_2d: Path | None = None
+    """The same of the 2D-only network."""
+    only_3d: Path | None = None
+    """The same of the 3D-only network."""
     animation: Path | None = None
     """An .npz of vertices [T V 3] and faces [F 3]; left out, a procedural one."""
     envmap: Path | None = None
@@ -78,7 +84,8 @@ def main(options: Options) -> dict[str, Any]:
     meshes = choose_frames(options, ground=options.effect != "sss")
     light = choose_light(options)
     key = jax.random.key(options.seed)
-    networks = load_networks(options.effect, settings, (None,) * 3, key=key)
+    runs = options.checkpoint, options.only_2d, options.only_3d
+    networks = load_networks(options.effect, settings, runs, key=key)
     given = meshes[0], options.points, options.effect != "sss"
     carried = sequences.carried_samples(*given, seed=options.seed)
     frames: dict[str, list[np.ndarray]] = {}

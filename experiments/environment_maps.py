@@ -31,7 +31,7 @@ from ginn_jax.lit_scenes import Scattering, light_mesh, lit_points, visible_samp
 from ginn_jax.mesh import add_ground, fit_unit_box, load_mesh
 from ginn_jax.metrics import tone_map
 from ginn_jax.objects import UNSEEN_SEED, random_point_light, tell_apart
-from ginn_jax.pretrained import load_pretrained
+from ginn_jax.pretrained import load_network
 from ginn_jax.reference import build_scene
 from ginn_jax.relight import Relightable, prepare_relighting, relight
 from ginn_jax.shapes import random_shape
@@ -45,6 +45,8 @@ class Options:
     """Global illumination or subsurface scattering."""
     out: Path = Path("runs/environment_maps")
     """Folder for metrics.json, report.md and the figure."""
+    checkpoint: Path | None = None
+    """The --out of a training run; left out, the weights that come with the package."""
     mesh: Path | None = None
     """A mesh file; left out, a procedural shape."""
     envmaps: Path | None = None
@@ -87,7 +89,7 @@ def main(options: Options) -> dict[str, Any]:
     mesh = mesh if scatters else add_ground(mesh)
     scene = build_scene(mesh)
     samples = visible_samples(scene, options.points, options.seed, not scatters)
-    config, limits, weights = load_pretrained(options.effect)
+    config, limits, weights = load_network(options.effect, options.checkpoint)
     camera = orbit_camera(width=options.resolution, height=options.resolution)
     ready: Relightable | None = None
     rows, pictures = [], []

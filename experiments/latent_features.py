@@ -25,7 +25,7 @@ from ginn_jax.lit_clouds import network_numbers
 from ginn_jax.lit_scenes import light_mesh, lit_points, visible_samples
 from ginn_jax.mesh import Mesh, add_ground, fit_unit_box, load_mesh
 from ginn_jax.objects import UNSEEN_SEED
-from ginn_jax.pretrained import load_pretrained
+from ginn_jax.pretrained import load_network
 from ginn_jax.reference import GBuffer, build_scene, render_gbuffer
 from ginn_jax.scenes import Occlusion
 from ginn_jax.shapes import random_shape
@@ -41,6 +41,8 @@ class Options:
     """Whose network."""
     out: Path = Path("runs/latent_features")
     """Folder for the figure."""
+    checkpoint: Path | None = None
+    """The --out of a training run; left out, the weights that come with the package."""
     mesh: Path | None = None
     """A mesh file; left out, a procedural shape."""
     channels: int = 4
@@ -90,7 +92,7 @@ def latent_code(
     options: Options, mesh: Mesh
 ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N K"]]:
     """Finest points and what f_3D says of them; of the first colour if there are."""
-    config, limits, weights = load_pretrained(options.effect)
+    config, limits, weights = load_network(options.effect, options.checkpoint)
     sheets = options.effect != "sss"
     scene = build_scene(mesh)
     samples = visible_samples(scene, options.points, options.seed, sheets)

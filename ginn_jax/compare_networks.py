@@ -11,7 +11,7 @@ from jaxtyping import Array, Key
 
 from ginn_jax import evaluate, evaluate_light
 from ginn_jax.architecture import Network
-from ginn_jax.checkpoint import RECORD, damaged, load_weights, read_record
+from ginn_jax.checkpoint import RECORD, damaged, read_record
 from ginn_jax.compare import Picture, Shot, Values, of_variance, scratch_mib
 from ginn_jax.dataset import ShadedPoints, count_given
 from ginn_jax.errors import InputError
@@ -32,7 +32,7 @@ from ginn_jax.limits import Limits
 from ginn_jax.lit_clouds import LitCloud, mean_light, network_numbers, split_points
 from ginn_jax.neighbors import bucket
 from ginn_jax.objects import Source
-from ginn_jax.pretrained import load_manifest, load_pretrained
+from ginn_jax.pretrained import load_manifest, load_network
 from ginn_jax.receptive_field import Oriented
 from ginn_jax.scenes import Occlusion, Settings
 
@@ -57,9 +57,7 @@ def load_networks(
     """
     networks = {}
     for (name, ending), run in zip(NETWORKS.items(), runs, strict=True):
-        config, limits, weights = (
-            load_pretrained(effect + ending) if run is None else load_weights(run)
-        )
+        config, limits, weights = load_network(effect + ending, run)
         if isinstance(settings, Occlusion):
             check_radius(name, learned_from(effect + ending, run), settings.radius)
         networks[name] = config.network, limits, Model(weights, key)

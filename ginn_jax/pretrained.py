@@ -81,9 +81,14 @@ def starting_weights(name: str, config: Training) -> Variables:
 
 
 def load_any(name: str) -> tuple[Training, Limits, Variables]:
-    """`load_weights` of the folder of a run, else `load_pretrained`."""
+    """The network of a run, if `name` is a path or a folder, else `load_pretrained`."""
     run = Path(name)
-    return load_weights(run) if run.is_dir() else load_pretrained(name)
+    return load_network(name, run if run.is_dir() or len(run.parts) > 1 else None)
+
+
+def load_network(name: str, run: Path | None) -> tuple[Training, Limits, Variables]:
+    """The network of a finished run or, for None, the package's of that name."""
+    return load_pretrained(name) if run is None else load_weights(run)
 
 
 def read_weights(path: Path, config: Training) -> Variables:

@@ -9,7 +9,7 @@ import pytest
 import tiny
 
 from experiments import animation, environment_maps, latent_features
-from ginn_jax import compare_networks, inference, train
+from ginn_jax import compare_networks, inference, pretrained, train
 from ginn_jax.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("cheap_compiling")
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
 @cache
 def untrained(effect):
-    """What `load_pretrained` gives, of the tiny network before its first step."""
+    """What `load_network` gives, of the tiny network before its first step."""
     plain = replace(tiny.ONE_LEVEL, latent=4)
     lit = replace(plain, materials=1, lights=1)
     scattering = replace(lit, materials=3, asks="all", local=True)
@@ -31,10 +31,13 @@ def untrained(effect):
 def tiny_networks(monkeypatch):
     # Every picture has full blocks, so one shape is compiled.
     monkeypatch.setattr(inference, "BLOCK", 128)
+
+    def load(name, run):
+        given = name, run
+        return pretrained.load_network(*given) if run else untrained(name.split("_")[0])
+
     for module in (compare_networks, environment_maps, latent_features):
-        monkeypatch.setattr(
-            module, "load_pretrained", lambda name: untrained(name.split("_")[0])
-        )
+        monkeypatch.setattr(module, "load_network", load)
 
 
 @pytest.mark.parametrize("effect", ["ao", "sss"])
@@ -55,6 +58,13 @@ def test_animation_tells_the_flicker_of_every_method(tmp_path, effect):
     text = (tmp_path / "report.md").read_text()
     assert "procedural" in text
     assert all(name in text for name in methods)
+
+
+@pytest.mark.parametrize("script", [animation, environment_maps, latent_features])
+def test_networks_of_runs_are_taken_where_they_are_named(tmp_path, script):
+    options = script.Options(out=tmp_path / "out", checkpoint=tmp_path)
+    with pytest.raises(InputError, match="no run: name the --out of one"):
+        script.main(options)
 
 
 def test_a_network_of_another_occlusion_radius_is_refused(tmp_path):
