@@ -1,7 +1,10 @@
-"""Two settings of a process that make XLA faster on CPU; call before any JAX work."""
+"""How a process is set up: what makes XLA faster on CPU, and when a worker ends."""
 
 import ctypes
+import multiprocessing
 import os
+import threading
+from multiprocessing import connection
 
 import jax
 
@@ -14,7 +17,7 @@ TRIM_THRESHOLD, TOP_PAD, MMAP_MAX, ARENA_MAX = -1, -2, -4, -8
 
 
 def tune_process(devices: int | None = None) -> None:
-    """Keep freed memory, and make every core a JAX device.
+    """Keep freed memory, and make every core a JAX device; call before any JAX work.
 
     XLA allocates its scratch memory anew for each call; glibc returns blocks that large
     to the kernel, so each call pays a page fault for every 4 KiB it touches: a
@@ -31,6 +34,22 @@ def tune_process(devices: int | None = None) -> None:
     except (AttributeError, OSError, TypeError):
         pass
     jax.config.update("jax_num_cpu_devices", devices or available_cores())
+
+
+def end_with_parent() -> None:
+    """Let a worker end when the process that started it does, however that ended.
+
+    It would wait for work forever: it holds the other end of its queue itself.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        given = [parent.sentinel]
+        threading.Thread(target=_end_after, args=(given,), daemon=True).start()
+
+
+def _end_after(sentinels: list[int]) -> None:
+    connection.wait(sentinels)
+    os._exit(1)
 
 
 def available_cores() -> int:

@@ -13,6 +13,7 @@ from ginn_jax.lit_clouds import Cloud, load_lit_cloud, save_lit_cloud
 from ginn_jax.lit_scenes import Illumination, Scattering, lit_cloud, visible_samples
 from ginn_jax.mesh import Mesh
 from ginn_jax.objects import Source, load_object, origin_of
+from ginn_jax.process import end_with_parent
 from ginn_jax.reference import ambient_occlusion, build_scene
 
 # Bounds what a renderer could leak in one process. Not by `max_tasks_per_child`, with
@@ -96,7 +97,7 @@ def _run_jobs(
 ) -> Iterator[Path]:
     """Make these clouds in processes of their own."""
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+    with ProcessPoolExecutor(workers, context, end_with_parent) as pool:
         done = {
             pool.submit(make_cloud, source, settings, path): path
             for path, source in jobs

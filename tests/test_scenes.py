@@ -1,3 +1,7 @@
+import signal
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import tiny
@@ -137,12 +141,35 @@ def test_workers_make_the_same_and_keep_what_is_done(sources, made, tmp_path):
     assert contents(tmp_path / "new") == before
 
 
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from ginn_jax import objects, scenes
+
+if __name__ == "__main__":
+    sources = objects.procedural_sources(3, 5)
+    settings = scenes.Occlusion(points=300, rays=4, radius=0.2)
+    for path in scenes.make_clouds(sources, settings, Path(sys.argv[1]), 1):
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_workers_end_with_the_run_that_is_killed(tmp_path):
+    script = tmp_path / "killed.py"
+    script.write_text(KILLED)
+    given = [sys.executable, script, tmp_path / "clouds"]
+    # Its output ends when the last process that holds it has ended.
+    done = subprocess.run(given, stdout=subprocess.PIPE, timeout=120)
+    assert done.returncode == -signal.SIGKILL
+    assert list((tmp_path / "clouds").glob("*.npz"))
+
+
 def test_no_process_makes_more_than_its_share(monkeypatch, tmp_path):
     """A pool that replaces its processes as they tire may wait for one forever."""
     pools = []
 
     class Pool(tiny.Here):
-        def __init__(self, workers, mp_context):
+        def __init__(self, workers, *_):
             pools.append((workers, []))
 
         def submit(self, function, source, settings, path):
