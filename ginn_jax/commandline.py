@@ -40,7 +40,7 @@ def start(
     tune_process()
     traced = bool(os.environ.get("GINN_JAX_TRACEBACK"))
     if not traced:
-        silence_threads()
+        silence()
     try:
         main(hasten(options, quick))
     except KeyboardInterrupt:
@@ -52,13 +52,15 @@ def start(
         fail(message, code)
 
 
-def silence_threads() -> None:
+def silence() -> None:
     """Let no thread print a traceback: what matters of it reaches the main one.
 
-    TensorStore's and orbax's would where a checkpoint turns out to be damaged.
+    TensorStore's and orbax's would where a checkpoint turns out to be damaged. That
+    limits were raised is of use to who calls the library, not to who runs a script.
     """
     sys.excepthook = threading.excepthook = sys.unraisablehook = lambda *_: None
-    logging.getLogger("absl").setLevel(logging.CRITICAL)
+    for name in ("absl", "ginn_jax"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
 def explain(error: Exception) -> tuple[int, str]:
@@ -115,9 +117,14 @@ def require_positive(options: Any, name: str) -> None:
 
 
 def require(options: Any, least: Mapping[str, int]) -> None:
-    """Raise `InputError` for the first option below its least value, or beyond all."""
+    """Raise `InputError` for the first option below its least value, or beyond all.
+
+    One that was not given, None, passes.
+    """
     for name, minimum in least.items():
         flag, value = name.replace("_", "-"), getattr(options, name)
+        if value is None:
+            continue
         if value < minimum:
             raise InputError(f"--{flag} is {value}: give at least {minimum}")
         if value > LARGEST_INDEX:
