@@ -139,7 +139,7 @@ def train(
     begin, weights = time.perf_counter(), None
     if options.start is not None:
         weights = starting_weights(options.start, config)
-        extra = extra | {"start": options.start}
+    extra = extra | {"start": options.start}
     for name in report.RESULTS:
         (options.out / name).unlink(missing_ok=True)
     with bar(console) as progress:
