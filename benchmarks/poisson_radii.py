@@ -59,9 +59,9 @@ class Options:
     """A mesh file or a folder of meshes; without it procedural shapes."""
     shapes: int = 2
     """Procedural shapes, of seeds that training does not use."""
-    radii: tuple[float, ...] = (0.01, 0.015, 0.02, 0.025)
+    radii: tuple[float, ...] = (0.0075, 0.01, 0.0125, 0.015)
     """Poisson disk radii, in units of the object's longest side."""
-    points: int = 32_000
+    points: int = 64_000
     """Samples of an object before the disk; few of them starve the small radii."""
     resolution: int = 512
     """Side of the image in pixels."""
@@ -75,7 +75,7 @@ class Options:
     """Two radii, a small image, few rays: to try things, not for numbers."""
 
 
-QUICK = {"radii": (0.015, 0.02), "points": 4000, "resolution": 96, "rays": 32}
+QUICK = {"radii": (0.01, 0.015), "points": 4000, "resolution": 96, "rays": 32}
 QUICK |= {"repeats": 2}
 
 

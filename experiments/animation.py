@@ -59,8 +59,9 @@ class Options:
     """Side of the images in pixels."""
     reference: int = 256
     """Rays or paths per pixel of the reference."""
-    points: int = 16_000
-    """Samples of the object and its ground."""
+    points: int | None = None
+    """Samples of the object and its ground; left out, 64,000 for ambient occlusion,
+    32,000 for light."""
     looks: int = 512
     """Directions of the direct light per sample and pixel."""
     radius: float = 0.1
@@ -86,7 +87,7 @@ def main(options: Options) -> dict[str, Any]:
     key = jax.random.key(options.seed)
     runs = options.checkpoint, options.only_2d, options.only_3d
     networks = load_networks(options.effect, settings, runs, key=key)
-    given = meshes[0], options.points, options.effect != "sss"
+    given = meshes[0], settings.points, options.effect != "sss"
     carried = sequences.carried_samples(*given, seed=options.seed)
     frames: dict[str, list[np.ndarray]] = {}
     with bar(console) as progress:

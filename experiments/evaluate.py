@@ -84,8 +84,9 @@ class Options:
     """Rays or paths per pixel of the traced rivals."""
     disks: tuple[float, ...] = (0.75, 1.5)
     """Poisson disk radii at which our network runs beside its own, as times that."""
-    points: int = 32_000
-    """Samples per object; a fifth of them measure, the others are given."""
+    points: int | None = None
+    """Samples per object, of which a fifth measure, the others are given; left out,
+    64,000 for ambient occlusion, 32,000 for light."""
     looks: int = 512
     """Directions of the direct light per sample and pixel: what all are given."""
     radius: float = 0.1
@@ -113,7 +114,7 @@ def main(options: Options) -> dict[str, Any]:
     key = jax.random.key(options.seed)
     networks = load_networks(options.effect, settings, runs, key=key)
     if not isinstance(settings, Occlusion):
-        targets = count_asked(options.points)
+        targets = count_asked(settings.points)
         settings = replace(settings, looks=options.looks, targets=targets)
     clouds = make(console, "clouds", sources, settings, options.out / "clouds")
     at_points, networks = errors_at_points(networks, clouds, sources, settings)
@@ -126,7 +127,7 @@ def main(options: Options) -> dict[str, Any]:
         shown.append((source.name, found[2]))
         networks = found[3]
     memory = {
-        name: network_memory(trained, count_given(options.points))
+        name: network_memory(trained, count_given(settings.points))
         for name, trained in networks.items()
     }
     at_points = {n: r | {"memory_mib": memory[n]} for n, r in at_points.items()}

@@ -49,8 +49,9 @@ class Options:
     """Channels of the code to show beside its principal components."""
     resolution: int = 384
     """Side of the images in pixels."""
-    points: int = 16_000
-    """Samples of the object and its ground."""
+    points: int | None = None
+    """Samples of the object and its ground; left out, 64,000 for ambient occlusion,
+    32,000 for light."""
     seed: int = 0
     """Seed of everything."""
     quick: bool = False
@@ -94,9 +95,9 @@ def latent_code(
     """Finest points and what f_3D says of them; of the first colour if there are."""
     config, limits, weights = load_network(options.effect, options.checkpoint)
     sheets = options.effect != "sss"
-    scene = build_scene(mesh)
-    samples = visible_samples(scene, options.points, options.seed, sheets)
     settings = compare.effect_settings(options.effect, options.points, 2, 0.1)
+    scene = build_scene(mesh)
+    samples = visible_samples(scene, settings.points, options.seed, sheets)
     numbers: tuple[Any, ...] = ()
     if not isinstance(settings, Occlusion):
         light = procedural_environment(UNSEEN_SEED + options.seed)

@@ -25,6 +25,8 @@ Shot = View | LitView
 Stage = Mesh | Lit
 Truth = Estimate | ColorEstimate
 Values = Float[np.ndarray, "P *C"]
+# Samples of an object at which every pixel has some within the reach of f_2D.
+SAMPLES = {"ao": 64_000, "gi": 32_000, "sss": 32_000}
 
 
 class Picture(NamedTuple):
@@ -96,11 +98,13 @@ def scratch_mib(compiled: Any) -> float:
     return compiled.memory_analysis().temp_size_in_bytes / 2**20
 
 
-def effect_settings(effect: str, points: int, paths: int, radius: float) -> Settings:
-    """The settings of an effect by its short name."""
+def effect_settings(
+    effect: str, points: int | None, paths: int, radius: float
+) -> Settings:
+    """The settings of an effect by its short name; for no points, its `SAMPLES`."""
     kinds: dict[str, Any] = {
         "ao": partial(Occlusion, radius=radius),
         "gi": Illumination,
         "sss": Scattering,
     }
-    return kinds[effect](points, paths)
+    return kinds[effect](points or SAMPLES[effect], paths)

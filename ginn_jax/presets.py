@@ -121,7 +121,7 @@ def with_ablations(network: Network) -> dict[str, Network]:
 
 
 # Creases are dark over a hundredth of the object: finer points than light needs.
-DEFAULT = compact_network(levels=(0.015, 0.04, 0.1), query_radius=0.0275, sided=True)
+DEFAULT = compact_network(levels=(0.01, 0.03, 0.1), query_radius=0.02, sided=True)
 
 
 PRESETS = {"default": DEFAULT, "paper": PAPER, "released": RELEASED}

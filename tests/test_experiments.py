@@ -34,6 +34,7 @@ SMALL = ao_train.Options(
     test_shapes=2,
     rays=8,
     points=1000,
+    test_points=1000,
     steps=2,
     resolution=32,
     quick=True,
@@ -72,6 +73,7 @@ def test_mistakes_end_in_one_line_and_code_2(tmp_path):
     [
         {"rays": 1},
         {"points": 10},
+        {"test_points": 10},
         {"steps": 0},
         {"radius": float("nan")},
         {"radius": -1.0},
@@ -79,7 +81,8 @@ def test_mistakes_end_in_one_line_and_code_2(tmp_path):
     ],
 )
 def test_options_that_cannot_be_meant_are_refused(wrong):
-    with pytest.raises(InputError, match=f"--{next(iter(wrong))}|no_such_run"):
+    flag = next(iter(wrong)).replace("_", "-")
+    with pytest.raises(InputError, match=f"--{flag}|no_such_run"):
         ao_train.main(replace(SMALL, **wrong))
 
 
