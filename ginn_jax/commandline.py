@@ -40,7 +40,7 @@ def start(
     tune_process()
     traced = bool(os.environ.get("GINN_JAX_TRACEBACK"))
     if not traced:
-        silence()
+        silence_threads()
     try:
         main(hasten(options, quick))
     except KeyboardInterrupt:
@@ -52,15 +52,13 @@ def start(
         fail(message, code)
 
 
-def silence() -> None:
+def silence_threads() -> None:
     """Let no thread print a traceback: what matters of it reaches the main one.
 
-    TensorStore's and orbax's would where a checkpoint turns out to be damaged. That
-    limits were raised is of use to who calls the library, not to who runs a script.
+    TensorStore's and orbax's would where a checkpoint turns out to be damaged.
     """
     sys.excepthook = threading.excepthook = sys.unraisablehook = lambda *_: None
-    for name in ("absl", "ginn_jax"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)
+    logging.getLogger("absl").setLevel(logging.CRITICAL)
 
 
 def explain(error: Exception) -> tuple[int, str]:
@@ -117,14 +115,9 @@ def require_positive(options: Any, name: str) -> None:
 
 
 def require(options: Any, least: Mapping[str, int]) -> None:
-    """Raise `InputError` for the first option below its least value, or beyond all.
-
-    One that was not given, None, passes.
-    """
+    """Raise `InputError` for the first option below its least value, or beyond all."""
     for name, minimum in least.items():
         flag, value = name.replace("_", "-"), getattr(options, name)
-        if value is None:
-            continue
         if value < minimum:
             raise InputError(f"--{flag} is {value}: give at least {minimum}")
         if value > LARGEST_INDEX:

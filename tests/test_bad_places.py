@@ -189,7 +189,7 @@ def test_losses_that_cannot_be_read_are_unknown(content, tmp_path):
 def ends(monkeypatch, capsys, script, *words, main=None):
     """The exit code of a script and the one line that it ends in."""
     monkeypatch.setattr(sys, "argv", ["script", *map(str, words)])
-    for name in ("tune_process", "silence"):
+    for name in ("tune_process", "silence_threads"):
         monkeypatch.setattr(commandline, name, lambda: None)
     with pytest.raises(SystemExit) as stopped:
         commandline.start(script.Options, main or script.main, {})
@@ -263,7 +263,7 @@ def test_what_ends_a_script_is_one_line(error, code, message, monkeypatch, capsy
 def test_our_mistakes_show_their_traceback_when_asked(monkeypatch):
     monkeypatch.setenv("GINN_JAX_TRACEBACK", "1")
     monkeypatch.setattr(sys, "argv", ["script"])
-    for name in ("tune_process", "silence"):
+    for name in ("tune_process", "silence_threads"):
         monkeypatch.setattr(commandline, name, lambda: None)
     with pytest.raises(ZeroDivisionError):
         commandline.start(ao_train.Options, raising(ZeroDivisionError()), {})
