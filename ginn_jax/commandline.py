@@ -115,9 +115,14 @@ def require_positive(options: Any, name: str) -> None:
 
 
 def require(options: Any, least: Mapping[str, int]) -> None:
-    """Raise `InputError` for the first option below its least value, or beyond all."""
+    """Raise `InputError` for the first option below its least value, or beyond all.
+
+    An option left out, None, has its value chosen by the script.
+    """
     for name, minimum in least.items():
         flag, value = name.replace("_", "-"), getattr(options, name)
+        if value is None:
+            continue
         if value < minimum:
             raise InputError(f"--{flag} is {value}: give at least {minimum}")
         if value > LARGEST_INDEX:

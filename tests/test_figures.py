@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tiny
 
-from experiments import animation, environment_maps, latent_features
+from experiments import animation, environment_maps, evaluate, latent_features
 from ginn_jax import compare_networks, inference, pretrained, train
 from ginn_jax.errors import InputError
 
@@ -60,7 +60,10 @@ def test_animation_tells_the_flicker_of_every_method(tmp_path, effect):
     assert all(name in text for name in methods)
 
 
-@pytest.mark.parametrize("script", [animation, environment_maps, latent_features])
+SCRIPTS = animation, environment_maps, evaluate, latent_features
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
 def test_networks_of_runs_are_taken_where_they_are_named(tmp_path, script):
     options = script.Options(out=tmp_path / "out", checkpoint=tmp_path)
     with pytest.raises(InputError, match="no run: name the --out of one"):
