@@ -4,6 +4,7 @@ Both hold no more than a block of queries at a time, and where a capacity is too
 they raise it and try again; the limits that sufficed come back for reuse.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -28,7 +29,15 @@ from ginn_jax.network import Variables
 from ginn_jax.process import ALONE
 from ginn_jax.receptive_field import Oriented
 from ginn_jax.searches import uniform_limits
-from ginn_jax.shading import Encoded, cloud_demands, encode, numbers_asked, shade
+from ginn_jax.shading import (
+    Encoded,
+    cloud_demands,
+    encode,
+    numbers_asked,
+    query_demands,
+    shade,
+)
+from ginn_jax.voxels import VoxelGrid
 
 BLOCK = 1 << 15
 
@@ -42,6 +51,9 @@ shade_block = jax.jit(
 
 
 _cloud_demands = jax.jit(cloud_demands, static_argnums=(0, 1))
+_query_demands = jax.jit(
+    query_demands, static_argnums=(0, 1), static_argnames="coherent"
+)
 
 
 def encode_cloud(
@@ -93,6 +105,25 @@ def cloud_limits(network: Network, cloud: Oriented, *, key: Key[Array, ""]) -> L
     return measure_limits(ample, probe, 1, SLACK)
 
 
+def query_limits(
+    network: Network,
+    finest: tuple[Oriented, VoxelGrid, Array | None],
+    blocks: Sequence[Oriented],
+    coherent: bool = False,
+) -> Limits:
+    """Limits that hold what f_2D of each block needs, measured with ample ones.
+
+    `finest` are the finest points of the cloud, their grid and their areas.
+    """
+    ample = uniform_limits(network, 16 * blocks[0].mask.shape[0])
+
+    def probe(limits: Limits, number: int) -> Demands:
+        given = network, limits, *finest, blocks[number]
+        return jax.device_get(_query_demands(*given, coherent=coherent))
+
+    return measure_limits(only(ample, network.query.name), probe, len(blocks), SLACK)
+
+
 def check_numbers(name: str, numbers: Any, width: int, rows: int) -> None:
     """Raise `InputError` unless so many numbers come with each of these points."""
     if width == 0 and numbers is not None:
@@ -142,6 +173,12 @@ def block_size(points: int, lit: bool) -> int:
     return min(BLOCK // 2 if lit else BLOCK, bucket(points))
 
 
+def in_blocks(points: Oriented, size: int) -> list[Oriented]:
+    """The points, so many at a time."""
+    starts = range(0, len(points.mask), size)
+    return [Oriented(*(a[i : i + size] for a in points)) for i in starts]
+
+
 def shade_points(
     network: Network,
     limits: Limits,
@@ -171,17 +208,16 @@ def shade_points(
     copies = [jax.device_put(needed, device) for device in jax.devices()]
     size = block_size(len(position), encoded.scale is not None)
     rows = -(-len(position) // size) * size
-    whole = pad_points(center, position, normal, rows)
+    blocks = in_blocks(pad_points(center, position, normal, rows), size)
     asked = numbers_asked(network, material, light)
     numbers = tuple(pad_channels(a, rows) for a in asked)
 
     def attempt(limits: Limits) -> tuple[list[Array], list[Demands]]:
         parts, demands = [], []
         flat = only(limits, network.query.name)
-        for turn, first in enumerate(range(0, rows, size)):
-            block = slice(first, first + size)
-            queries = Oriented(*(a[block] for a in whole))
-            own = (None if a is None else a[:, block] for a in numbers)
+        for turn, queries in enumerate(blocks):
+            rows = slice(turn * size, (turn + 1) * size)
+            own = (None if a is None else a[:, rows] for a in numbers)
             arrays = copies[turn % len(copies)]
             values, demand = shade_block(
                 network, flat, *arrays, queries, *own, coherent=coherent
@@ -190,7 +226,9 @@ def shade_points(
             demands.append(demand)
         return parts, demands
 
-    parts, sufficed = with_room(limits, attempt)
+    finest = encoded.points, encoded.grid, encoded.area
+    measure = partial(query_limits, network, finest, blocks, coherent)
+    parts, sufficed = with_room(limits, attempt, measure)
     say_raised(limits, sufficed)
     channels = () if encoded.scale is None else encoded.scale.shape
     values = [np.zeros((0, *channels), np.float32)]

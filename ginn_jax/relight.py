@@ -18,9 +18,11 @@ from ginn_jax.geometry import Geometry, build_geometry, build_query_field
 from ginn_jax.inference import (
     block_size,
     cloud_limits,
+    in_blocks,
     only,
     pad_channels,
     pad_points,
+    query_limits,
     without,
 )
 from ginn_jax.limits import Demands, Limits, say_raised, with_room
@@ -150,6 +152,9 @@ def prepare_relighting(
     rows = bucket(len(cloud.position))
     points = pad_points(center, cloud.position, cloud.normal, rows)
     size = block_size(len(queries.position), lit=True)
+    whole = -(-len(queries.position) // size) * size
+    ends = queries.position, queries.normal
+    blocks = in_blocks(pad_points(center, *ends, whole), size)
 
     def plan_points(limits: Limits) -> tuple[ScenePlan, list[Demands]]:
         deep = without(limits, network.query.name)
@@ -161,21 +166,20 @@ def prepare_relighting(
 
     def plan_blocks(limits: Limits) -> tuple[list[QueryPlan], list[Demands]]:
         flat = only(limits, network.query.name)
-        blocks, demands = [], []
-        for number, first in enumerate(range(0, len(queries.position), size)):
-            part = slice(first, first + size)
-            ends = queries.position[part], queries.normal[part]
-            block = pad_points(center, *ends, size)
+        plans, demands = [], []
+        for number, block in enumerate(blocks):
             ends = scene.geometry, block
             plan, demand = _plan_queries(network, flat, variables, *ends)
             device = jax.devices()[number % len(jax.devices())]
-            blocks.append(jax.device_put(plan, device))
+            plans.append(jax.device_put(plan, device))
             demands.append(demand)
-        return blocks, demands
+        return plans, demands
 
-    blocks, sufficed = with_room(sufficed, plan_blocks)
+    finest = scene.geometry.levels[0], scene.geometry.grid, scene.geometry.area
+    measure = partial(query_limits, network, finest, blocks)
+    plans, sufficed = with_room(sufficed, plan_blocks, measure)
     say_raised(limits, sufficed)
-    return Relightable(scene, tuple(blocks)), sufficed
+    return Relightable(scene, tuple(plans)), sufficed
 
 
 def relight(

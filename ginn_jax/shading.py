@@ -115,6 +115,20 @@ def shade(
     return values, demands
 
 
+def query_demands(
+    network: Network,
+    limits: Limits,
+    finest: Oriented,
+    grid: VoxelGrid,
+    area: Array | None,
+    queries: Oriented,
+    coherent: bool = False,
+) -> Demands:
+    """What `shade` needs of every capacity, without f_2D itself."""
+    queries = queries if coherent else in_coherent_order(queries)[0]
+    return build_query_field(network, limits, finest, grid, area, queries)[1]
+
+
 def shade_channels(
     network: Network,
     variables: Variables,
