@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+import orbax.checkpoint as ocp
 
 from ginn_jax.checkpoint import (
     UNSPENT,
@@ -36,7 +37,7 @@ from ginn_jax.train import (
     train_step,
 )
 
-PROBES = 300
+PROBES = 100
 
 
 @dataclass(frozen=True)
@@ -83,37 +84,26 @@ def fit(
     """
     _check(config, clouds)
     folder.mkdir(parents=True, exist_ok=True)
-    start, extra = time.perf_counter(), extra or {}
+    begin, extra = time.perf_counter(), extra or {}
     if resume:
         limits, seconds = load_run(folder, config, extra)
     else:
         limits, seconds = training_limits(config, clouds), dict(UNSPENT)
         save_run(folder, config, limits, extra, seconds)
     manager = open_manager(folder, fresh=not resume)
-    state, history, raised = (
-        init_state(config, weights),
-        list[float](),
-        dict[str, int](),
-    )
-    if resume and (found := restore_state(manager, state)) is not None:
-        state, history = found, load_losses(folder, int(found.step)).tolist()
-    seconds["compile"] += time.perf_counter() - start
-    compiled_for = None
-    while int(state.step) < config.steps:
-        step = int(state.step)
+    state, history = latest(manager, folder, init_state(config, weights), resume)
+    seconds["compile"] += time.perf_counter() - begin
+    compiled_for, raised = None, dict[str, int]()
+    while (step := int(state.step)) < config.steps:
         begin = time.perf_counter()
-        batch = step_batch(config, clouds, step)
-        state, report = train_step(config, limits, state, batch)
-        loss = float(report.loss)
-        if short := exceeded(limits, jax.device_get(report.demands)):
-            wider = widened(limits, batch_limits(config, batch, step), short)
+        state, loss, wider = step_with_room(config, limits, clouds, state)
+        purpose = "train" if compiled_for == wider else "compile"
+        seconds[purpose] += time.perf_counter() - begin
+        if wider != limits:
             more = {n: size for n, size in wider.sizes if size > limits.of(n)}
             progress(step, loss, f"raised {', '.join(more)}")
             limits, raised = wider, raised | more
-            seconds["compile"] += time.perf_counter() - begin
             continue
-        purpose = "train" if compiled_for == limits else "compile"
-        seconds[purpose] += time.perf_counter() - begin
         compiled_for = limits
         history.append(loss)
         if (step + 1) % schedule.report == 0:
@@ -124,6 +114,30 @@ def fit(
             save_state(manager, state)
     finish(manager)
     return Fit(state, limits, np.array(history, np.float32), seconds, raised)
+
+
+def latest(
+    manager: ocp.CheckpointManager, folder: Path, state: TrainState, resume: bool
+) -> tuple[TrainState, list[float]]:
+    """The newest state of a run that goes on, else `state`; the losses up to there."""
+    if resume and (found := restore_state(manager, state)) is not None:
+        return found, load_losses(folder, int(found.step)).tolist()
+    return state, []
+
+
+def step_with_room(
+    config: Training, limits: Limits, clouds: Sequence[Cloud], state: TrainState
+) -> tuple[TrainState, float, Limits]:
+    """A step, its loss and the same limits; or the same state and limits to repeat it.
+
+    The state given is used up either way.
+    """
+    step = int(state.step)
+    batch = step_batch(config, clouds, step)
+    state, report = train_step(config, limits, state, batch)
+    if short := exceeded(limits, jax.device_get(report.demands)):
+        limits = widened(limits, batch_limits(config, batch, step), short)
+    return state, float(report.loss), limits
 
 
 def recent_loss(history: Sequence[float], steps: int) -> float:

@@ -22,7 +22,7 @@ Demands = dict[str, Int[Any, ""]]
 Made = TypeVar("Made")
 # What is made room for beyond what was needed.
 SLACK = 1.25
-# Fewer probes than these take less time than compiling them for tighter limits does.
+# So many probes take less time than compiling them for tighter limits does.
 FEW = 8
 
 

@@ -4,7 +4,7 @@ import ctypes
 import multiprocessing
 import os
 import threading
-from multiprocessing import connection
+from multiprocessing.process import BaseProcess
 
 import jax
 
@@ -43,12 +43,11 @@ def end_with_parent() -> None:
     """
     parent = multiprocessing.parent_process()
     if parent is not None:
-        given = [parent.sentinel]
-        threading.Thread(target=_end_after, args=(given,), daemon=True).start()
+        threading.Thread(target=_end_after, args=(parent,), daemon=True).start()
 
 
-def _end_after(sentinels: list[int]) -> None:
-    connection.wait(sentinels)
+def _end_after(parent: BaseProcess) -> None:
+    parent.join()
     os._exit(1)
 
 
