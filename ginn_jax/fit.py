@@ -37,7 +37,7 @@ from ginn_jax.train import (
     train_step,
 )
 
-PROBES = 100
+PROBES = 300
 
 
 @dataclass(frozen=True)
