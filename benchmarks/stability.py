@@ -102,9 +102,7 @@ have 1,000 points. Times are of a second call on a machine that may have been bu
 What is outside: a point on a cell face may lie at exactly a radius from others, and
 once it is turned, rounding decides which are closer. Float32 at 1e6, where its step is
 .06, is probably such a lattice too. Light below 1.2e-38 is none: devices flush such
-numbers. At an occlusion radius of 1e-6 rays start 1e-8 off a surface that is rounded to
-3e-8, and it hides itself. Errors of indirect light and subsurface are to be read beside
-their noise.
+numbers. Errors of indirect light and subsurface are to be read beside their noise.
 
 Where the error stays under {GOOD:g}:
 

@@ -107,7 +107,7 @@ def occlusion_rows() -> list[Row]:
     """In a closed ball nothing is open to far rays, everything to short ones."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
     points, normals = samples(ball, 64)
-    radii = {0.0: 1.0, 1e-20: 1.0, 1e-6: 1.0, 2.0: 0.0, 1e6: 0.0, 1e30: 0.0}
+    radii = {0.0: 1.0, 1e-6: 1.0, 1e-5: 1.0, 2.0: 0.0, 1e6: 0.0, 1e30: 0.0}
     return [
         ray_row(
             "occlusion",

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int, UInt
 
 from ginn_jax.camera import Camera, pixel_directions
 from ginn_jax.checks import LARGEST_SEED, positive, unit_rows, whole
+from ginn_jax.errors import InputError
 from ginn_jax.mesh import Mesh, check_mesh
 from ginn_jax.renderer import use_mitsuba
 
@@ -18,6 +19,9 @@ RAYS_PER_LAUNCH = 2**22
 # Rays start this far off the surface, relative to the largest coordinate: about 160
 # float32 rounding steps, so that a surface never shades itself.
 OFFSET = 1e-5
+# Within less than half of this, also relative to the largest coordinate, surfaces were
+# measured to hide themselves: rays start a hundredth of the radius off them.
+LEAST_RADIUS = 2e-5
 
 
 class Estimate(NamedTuple):
@@ -63,6 +67,7 @@ def ambient_occlusion(
     """
     scene = mesh if isinstance(mesh, Scene) else build_scene(mesh)
     _check_rays(points, normals, radius, rays, seed)
+    _check_radius(scene, radius)
     blocked = [
         _count_blocked(scene, *launch, radius, rays, seed)
         for launch in launches(points, normals, rays, RAYS_PER_LAUNCH)
@@ -200,3 +205,13 @@ def _check_rays(points: Any, normals: Any, radius: float, rays: int, seed: int) 
     positive("radius", radius)
     whole("rays", rays, 1, RAYS_PER_LAUNCH)
     whole("seed", seed, 0, LARGEST_SEED)
+
+
+def _check_radius(scene: Scene, radius: float) -> None:
+    """Raise `InputError` for a radius that float32 coordinates do not resolve."""
+    largest = float(np.abs(scene.mesh.vertices).max())
+    if radius < LEAST_RADIUS * largest:
+        raise InputError(
+            f"radius {radius:g} is too short for coordinates up to {largest:g}: give "
+            f"at least {LEAST_RADIUS * largest:.3g}"
+        )

@@ -131,6 +131,7 @@ TABLE: Table = {
         ((CLOUD._replace(normal=UP * 0),), "normals are .* not of unit length"),
     ],
     occlusion: [
+        ({"radius": 1e-6}, "radius 1e-06 is too short for coordinates up to"),
         *PLACES,
         ({"radius": -1.0}, "radius -1.0 must be positive"),
         ({"radius": 0.0}, "radius 0.0 must be positive"),

@@ -45,6 +45,22 @@ def test_floor_of_a_closed_box_is_dark():
     np.testing.assert_array_equal(result.mean, 0)
 
 
+@pytest.mark.parametrize("shift", [0.0, 100.0])
+def test_no_surface_hides_itself_at_the_least_radius(shift):
+    """Coordinates round off the sphere by a share of the largest of them."""
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
+    mesh = solid(ball.apply_translation([shift] * 3))
+    corner = mesh.vertices[mesh.faces].astype(np.float64)
+    share = np.random.default_rng(0).dirichlet([1, 1, 1], len(corner))
+    points = (share[:, :, None] * corner).sum(1).astype(np.float32)
+    normals = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    radius = reference.LEAST_RADIUS * float(np.abs(mesh.vertices).max())
+    given = mesh, points, normals, radius
+    result = reference.ambient_occlusion(*given, rays=64, seed=0)
+    np.testing.assert_array_equal(result.mean, 1)
+
+
 def test_half_is_blocked_at_the_foot_of_a_wall():
     points, normals = copies((1e-5, 0, 0), 2000)
     scene = floor_and_wall(100)
