@@ -23,7 +23,7 @@ from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import Cloud
 from ginn_jax.objects import SEEDS_APART, UNSEEN_SEED, Source
 from ginn_jax.pretrained import load_any, starting_weights
-from ginn_jax.process import available_cores
+from ginn_jax.process import available_cores, forget_programs
 from ginn_jax.train import Training
 
 
@@ -153,7 +153,9 @@ def train(
                 console.print(f"step {step} of {config.steps}: {text}")
 
         given = config, clouds, options.out, fit.Schedule(), tell, options.resume
-        return fit.fit(*given, extra, weights)
+        run = fit.fit(*given, extra, weights)
+    forget_programs()
+    return run
 
 
 def training(

@@ -26,6 +26,7 @@ from ginn_jax.files import writing
 from ginn_jax.limits import SLACK, Limits, exceeded, measure_limits, widened
 from ginn_jax.lit_clouds import Cloud, channel_of
 from ginn_jax.network import Variables
+from ginn_jax.process import forget_programs
 from ginn_jax.searches import uniform_limits
 from ginn_jax.train import (
     Training,
@@ -103,6 +104,7 @@ def fit(
             more = {n: size for n, size in wider.sizes if size > limits.of(n)}
             progress(step, loss, f"raised {', '.join(more)}")
             limits, raised = wider, raised | more
+            forget_programs()
             continue
         compiled_for = limits
         history.append(loss)

@@ -1,6 +1,7 @@
 """How a process is set up: what makes XLA faster on CPU, and when a worker ends."""
 
 import ctypes
+import gc
 import multiprocessing
 import os
 import threading
@@ -34,6 +35,16 @@ def tune_process(devices: int | None = None) -> None:
     except (AttributeError, OSError, TypeError):
         pass
     jax.config.update("jax_num_cpu_devices", devices or available_cores())
+
+
+def forget_programs() -> None:
+    """Let go of all that JAX compiled, before much else is.
+
+    Every kernel has memory maps of its own, a training step some thousands; of the
+    65,530 that Linux lets a process have none are left after two or three of those.
+    """
+    jax.clear_caches()
+    gc.collect()
 
 
 def end_with_parent() -> None:

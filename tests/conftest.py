@@ -81,4 +81,6 @@ def cheap_compiling():
 def _forget_compilations():
     """Each module's own: thousands of kernels exhaust the maps a process may have."""
     yield
-    jax.clear_caches()
+    from ginn_jax.process import forget_programs  # after the hook, as above
+
+    forget_programs()

@@ -92,6 +92,8 @@ def test_training_goes_on(tmp_path, monkeypatch):
     # The heap wants more pairs than the first cloud did: said, and raised once.
     assert "level_0.edges" in found.raised
     assert len([n for n in notes if "level_0.edges" in n]) <= 2
+    # Two or three programs of a step are all that a process has memory maps for.
+    assert fit.train_step._cache_size() == 1
     weights = checkpoint.load_weights(tmp_path)[2]
     assert_finite(weights)
 
