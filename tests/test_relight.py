@@ -15,14 +15,16 @@ from ginn_jax.searches import limit_names, uniform_limits
 
 KEY = jax.random.key(1)
 LOCAL = replace(tiny.ONE_LEVEL, materials=3, lights=1, asks="all", local=True)
-# Pooling and its way back once for what is linear; where nothing but f_3D can be
-# nonlinear, one convolution of it suffices.
+# Pooling and its way back once for what is linear, and once where nothing but f_3D can
+# be nonlinear.
 EFFECTS = {
     "linear": replace(tiny.NETWORK, linear=True, materials=3, lights=1, asks="all"),
     "homogeneous": replace(tiny.ONE_LEVEL, materials=1, lights=1),
     "local": LOCAL,
     "only_2d": only_2d(LOCAL),
-    "only_3d": only_3d(LOCAL),
+    "only_3d": only_3d(
+        replace(tiny.NETWORK, materials=3, lights=1, asks="all", local=True)
+    ),
 }
 
 
