@@ -1,7 +1,7 @@
 """f_3D of a cloud once, f_2D at any points: on the host, sizing themselves.
 
 Both hold no more than a block of queries at a time, and where a capacity is too small
-they raise it and try again; the limits that sufficed come back for reuse.
+they measure what is needed and try again; the limits that sufficed come back for reuse.
 """
 
 from collections.abc import Sequence
@@ -118,7 +118,7 @@ def query_limits(
     ample = uniform_limits(network, 16 * blocks[0].mask.shape[0])
 
     def probe(limits: Limits, number: int) -> Demands:
-        given = network, limits, *finest, blocks[number]
+        given = network, limits, finest, blocks[number]
         return jax.device_get(_query_demands(*given, coherent=coherent))
 
     return measure_limits(only(ample, network.query.name), probe, len(blocks), SLACK)
@@ -173,9 +173,16 @@ def block_size(points: int, lit: bool) -> int:
     return min(BLOCK // 2 if lit else BLOCK, bucket(points))
 
 
-def in_blocks(points: Oriented, size: int) -> list[Oriented]:
-    """The points, so many at a time."""
-    starts = range(0, len(points.mask), size)
+def in_blocks(
+    center: Float[np.ndarray, "3"] | None,
+    position: Float[np.ndarray, "M 3"],
+    normal: Float[np.ndarray, "M 3"],
+    size: int,
+) -> list[Oriented]:
+    """Points counted from `center`, so many at a time; the last block is padded."""
+    rows = -(-len(position) // size) * size
+    points = pad_points(center, position, normal, rows)
+    starts = range(0, rows, size)
     return [Oriented(*(a[i : i + size] for a in points)) for i in starts]
 
 
@@ -207,10 +214,9 @@ def shade_points(
     needed = {"shader": variables["shader"]}, encoded
     copies = [jax.device_put(needed, device) for device in jax.devices()]
     size = block_size(len(position), encoded.scale is not None)
-    rows = -(-len(position) // size) * size
-    blocks = in_blocks(pad_points(center, position, normal, rows), size)
+    blocks = in_blocks(center, position, normal, size)
     asked = numbers_asked(network, material, light)
-    numbers = tuple(pad_channels(a, rows) for a in asked)
+    numbers = tuple(pad_channels(a, len(blocks) * size) for a in asked)
 
     def attempt(limits: Limits) -> tuple[list[Array], list[Demands]]:
         parts, demands = [], []

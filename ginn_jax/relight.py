@@ -152,9 +152,7 @@ def prepare_relighting(
     rows = bucket(len(cloud.position))
     points = pad_points(center, cloud.position, cloud.normal, rows)
     size = block_size(len(queries.position), lit=True)
-    whole = -(-len(queries.position) // size) * size
-    ends = queries.position, queries.normal
-    blocks = in_blocks(pad_points(center, *ends, whole), size)
+    blocks = in_blocks(center, queries.position, queries.normal, size)
 
     def plan_points(limits: Limits) -> tuple[ScenePlan, list[Demands]]:
         deep = without(limits, network.query.name)

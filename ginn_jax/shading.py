@@ -118,15 +118,13 @@ def shade(
 def query_demands(
     network: Network,
     limits: Limits,
-    finest: Oriented,
-    grid: VoxelGrid,
-    area: Array | None,
+    finest: tuple[Oriented, VoxelGrid, Array | None],
     queries: Oriented,
     coherent: bool = False,
 ) -> Demands:
     """What `shade` needs of every capacity, without f_2D itself."""
     queries = queries if coherent else in_coherent_order(queries)[0]
-    return build_query_field(network, limits, finest, grid, area, queries)[1]
+    return build_query_field(network, limits, *finest, queries)[1]
 
 
 def shade_channels(

@@ -19,6 +19,7 @@ LOCAL = replace(tiny.ONE_LEVEL, materials=3, lights=1, asks="all", local=True)
 # be nonlinear.
 EFFECTS = {
     "linear": replace(tiny.NETWORK, linear=True, materials=3, lights=1, asks="all"),
+    "illumination": replace(tiny.ONE_LEVEL, linear=True, materials=1, lights=1),
     "homogeneous": replace(tiny.ONE_LEVEL, materials=1, lights=1),
     "local": LOCAL,
     "only_2d": only_2d(LOCAL),
