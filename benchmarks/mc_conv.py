@@ -24,7 +24,8 @@ from benchmarks.neighbors import surface, uniform
 from benchmarks.timing import circumstances, describe, measure
 from ginn_jax import report
 from ginn_jax.commandline import require, start
-from ginn_jax.mcconv import Kernel, init_kernel, mc_conv
+from ginn_jax.kernels import Kernel, init_kernel
+from ginn_jax.mcconv import mc_conv
 from ginn_jax.neighbors import find_neighbors
 from ginn_jax.process import available_cores
 from ginn_jax.receptive_field import Field

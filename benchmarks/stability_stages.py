@@ -13,7 +13,8 @@ import numpy as np
 from benchmarks.stability_cases import Case, many_points
 from ginn_jax import hierarchy
 from ginn_jax.errors import InputError
-from ginn_jax.mcconv import init_kernel, mc_conv
+from ginn_jax.kernels import init_kernel
+from ginn_jax.mcconv import mc_conv
 from ginn_jax.neighbors import find_neighbors
 from ginn_jax.packets import EdgeLimit, radius_edges
 from ginn_jax.receptive_field import (

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ginn_jax.architecture import Network
-from ginn_jax.mcconv import Kernel
+from ginn_jax.kernels import Kernel
 from ginn_jax.network import SLOPE, Variables
 from ginn_jax.receptive_field import Oriented
 

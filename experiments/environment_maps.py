@@ -59,8 +59,8 @@ class Options:
     """Side of the images in pixels."""
     reference: int = 256
     """Paths per pixel of the reference."""
-    points: int = 16_000
-    """Samples of the object and its ground."""
+    points: int | None = None
+    """Samples of the object and its ground; left out, 32,000."""
     seed: int = 0
     """Seed of everything."""
     quick: bool = False
@@ -88,7 +88,7 @@ def main(options: Options) -> dict[str, Any]:
     )
     mesh = mesh if scatters else add_ground(mesh)
     scene = build_scene(mesh)
-    samples = visible_samples(scene, options.points, options.seed, not scatters)
+    samples = visible_samples(scene, settings.points, options.seed, not scatters)
     config, limits, weights = load_network(options.effect, options.checkpoint)
     camera = orbit_camera(width=options.resolution, height=options.resolution)
     ready: Relightable | None = None

@@ -34,19 +34,7 @@ from ginn_jax.dataset import count_asked, count_given
 from ginn_jax.disk_radius import limits_at, with_disk_radius
 from ginn_jax.evaluate import Row
 from ginn_jax.experiment import make
-from ginn_jax.lighting import find_environments
-from ginn_jax.lit_scenes import light_up
-from ginn_jax.mesh import find_meshes
-from ginn_jax.objects import (
-    UNSEEN_SEED,
-    Source,
-    file_lights,
-    file_sources,
-    load_object,
-    pair_up,
-    procedural_lights,
-    procedural_sources,
-)
+from ginn_jax.objects import Source
 from ginn_jax.scenes import Occlusion, Settings, cloud_origin
 
 TITLES = {"ao": "Ambient occlusion", "gi": "Global illumination"}
@@ -109,7 +97,10 @@ def main(options: Options) -> dict[str, Any]:
     targets = 64 if options.quick else TARGET_PATHS
     given = options.effect, options.points, targets, options.radius
     settings = compare.effect_settings(*given)
-    sources = choose_sources(options)
+    where = options.meshes, options.envmaps
+    sources = compare.unseen_sources(
+        options.effect, options.objects, *where, seed=options.seed
+    )
     runs = options.checkpoint, options.only_2d, options.only_3d
     key = jax.random.key(options.seed)
     networks = load_networks(options.effect, settings, runs, key=key)
@@ -145,27 +136,6 @@ def main(options: Options) -> dict[str, Any]:
     return metrics
 
 
-def choose_sources(options: Options) -> list[Source]:
-    """Unseen objects, under unseen lights where the effect has light."""
-    seed = UNSEEN_SEED + options.seed
-    objects = (
-        procedural_sources(options.objects, seed)
-        if options.meshes is None
-        else file_sources(find_meshes(options.meshes))
-    )
-    step = max(len(objects) // options.objects, 1)
-    objects = objects[::step][: options.objects]
-    if options.effect == "ao":
-        return objects
-    lights = (
-        procedural_lights(options.objects, seed)
-        if options.envmaps is None
-        else file_lights(find_environments(options.envmaps))
-    )
-    step = max(len(lights) // options.objects, 1)
-    return pair_up(objects, lights[::step], 1)
-
-
 def compare_scene(
     options: Options,
     settings: Settings,
@@ -177,11 +147,7 @@ def compare_scene(
 
     Rows of the table, rows of error against run time, pictures of the first view.
     """
-    stage = (
-        load_object(source)
-        if isinstance(settings, Occlusion)
-        else light_up(source, settings)
-    )
+    stage = compare.set_stage(source, settings)
     given, units = points_given(cloud)
     rows, front, shown = [], [], {}
     for view in range(options.views):

@@ -5,6 +5,7 @@ A shot is one scene under one camera, of ambient occlusion (`View`) or of light
 """
 
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,9 +16,20 @@ from ginn_jax.camera import Camera
 from ginn_jax.evaluate import Row, View
 from ginn_jax.evaluate_light import LitView
 from ginn_jax.irradiance import ColorEstimate
-from ginn_jax.lit_scenes import Illumination, Lit, Scattering
-from ginn_jax.mesh import Mesh
+from ginn_jax.lighting import find_environments
+from ginn_jax.lit_scenes import Illumination, Lit, Scattering, light_up
+from ginn_jax.mesh import Mesh, find_meshes
 from ginn_jax.metrics import relative_error
+from ginn_jax.objects import (
+    UNSEEN_SEED,
+    Source,
+    file_lights,
+    file_sources,
+    load_object,
+    pair_up,
+    procedural_lights,
+    procedural_sources,
+)
 from ginn_jax.reference import Estimate
 from ginn_jax.scenes import Occlusion, Settings
 
@@ -34,6 +46,37 @@ class Picture(NamedTuple):
 
     row: Row
     values: Values
+
+
+def unseen_sources(
+    effect: str, count: int, meshes: Path | None, envmaps: Path | None, *, seed: int
+) -> list[Source]:
+    """Unseen objects, under unseen lights where the effect has light.
+
+    So many, evenly spread over the files of a folder; without one, procedural.
+    """
+    first = UNSEEN_SEED + seed
+    objects = (
+        procedural_sources(count, first)
+        if meshes is None
+        else file_sources(find_meshes(meshes))
+    )
+    objects = objects[:: max(len(objects) // count, 1)][:count]
+    if effect == "ao":
+        return objects
+    lights = (
+        procedural_lights(count, first)
+        if envmaps is None
+        else file_lights(find_environments(envmaps))
+    )
+    return pair_up(objects, lights[:: max(len(lights) // count, 1)], 1)
+
+
+def set_stage(source: Source, settings: Settings) -> Stage:
+    """The scene of a source."""
+    if isinstance(settings, Occlusion):
+        return load_object(source)
+    return light_up(source, settings)
 
 
 def take_shot(stage: Stage, camera: Camera, settings: Settings, *, seed: int) -> Shot:

@@ -55,13 +55,24 @@ def load_networks(
     Raises:
         InputError: a network of another occlusion radius than that of `settings`.
     """
-    networks = {}
-    for (name, ending), run in zip(NETWORKS.items(), runs, strict=True):
-        config, limits, weights = load_network(effect + ending, run)
-        if isinstance(settings, Occlusion):
-            check_radius(name, learned_from(effect + ending, run), settings.radius)
-        networks[name] = config.network, limits, Model(weights, key)
-    return networks
+    return {
+        name: load_trained(effect + ending, settings, run, key=key)
+        for (name, ending), run in zip(NETWORKS.items(), runs, strict=True)
+    }
+
+
+def load_trained(
+    name: str, settings: Settings, run: Path | None, *, key: Key[Array, ""]
+) -> Trained:
+    """The network of a finished run or, for None, the package's of that name.
+
+    Raises:
+        InputError: as `load_networks`.
+    """
+    config, limits, weights = load_network(name, run)
+    if isinstance(settings, Occlusion):
+        check_radius(name, learned_from(name, run), settings.radius)
+    return config.network, limits, Model(weights, key)
 
 
 def learned_from(name: str, run: Path | None) -> dict[str, Any]:

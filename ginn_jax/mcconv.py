@@ -17,76 +17,15 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Float, Int
 
+from ginn_jax.kernels import (
+    Kernel,
+    edges_first,
+    edges_first_to_differentiate,
+    evaluate_kernel,
+)
 from ginn_jax.receptive_field import Field, tile_count, tile_size
-
-
-class Kernel(NamedTuple):
-    """G independent perceptrons D -> H -> H -> K that make G * K kernel values."""
-
-    w1: Float[Array, "G D H"]
-    b1: Float[Array, "G H"]
-    w2: Float[Array, "G H H"]
-    b2: Float[Array, "G H"]
-    w3: Float[Array, "G H K"]
-    b3: Float[Array, "G K"]
-
-
-def init_kernel(
-    inputs: int, outputs: int, hidden: int, group: int, *, key: Key[Array, ""]
-) -> Kernel:
-    """Kernel with blocks of `group` outputs each; He-initialised, zero biases."""
-    blocks = -(-outputs // group)
-    shapes = [(inputs, hidden), (hidden, hidden), (hidden, group)]
-    keys = jax.random.split(key, len(shapes))
-    weights = [
-        jax.random.normal(k, (blocks, *shape)) * jnp.sqrt(2.0 / shape[0])
-        for k, shape in zip(keys, shapes, strict=True)
-    ]
-    biases = [jnp.zeros((blocks, shape[1])) for shape in shapes]
-    return Kernel(weights[0], biases[0], weights[1], biases[1], weights[2], biases[2])
-
-
-def evaluate_kernel(
-    kernel: Kernel, inputs: Float[Array, "D E"], outputs: int
-) -> Float[Array, "K E"]:
-    """Kernel values of every edge: a perceptron with two ReLU layers per block."""
-
-    def block(
-        w1: Array, b1: Array, w2: Array, b2: Array, w3: Array, b3: Array
-    ) -> Float[Array, "K E"]:
-        # XLA's products are fast on weights that lie turned, not on weights it turns.
-        w1, w2, w3 = (jax.lax.optimization_barrier(w.T) for w in (w1, w2, w3))
-        hidden = jax.nn.relu(w1 @ inputs + b1[:, None])
-        hidden = jax.nn.relu(w2 @ hidden + b2[:, None])
-        return w3 @ hidden + b3[:, None]
-
-    values = [block(*(a[i] for a in kernel)) for i in range(kernel.w1.shape[0])]
-    return jnp.concatenate(values)[:outputs]
-
-
-def _edges_first(
-    kernel: Kernel, inputs: Float[Array, "D E"], outputs: int
-) -> Float[Array, "E K"]:
-    """The transpose of `evaluate_kernel`, by itself: in a product it costs more."""
-    return jax.lax.optimization_barrier(evaluate_kernel(kernel, inputs, outputs)).T
-
-
-def _edges_first_to_differentiate(
-    kernel: Kernel, inputs: Float[Array, "D E"], outputs: int
-) -> Float[Array, "E K"]:
-    """The same in the form whose gradient XLA computes faster, by a fifth."""
-
-    def block(
-        w1: Array, b1: Array, w2: Array, b2: Array, w3: Array, b3: Array
-    ) -> Float[Array, "E K"]:
-        hidden = jax.nn.relu(jnp.einsum("ih,ie->he", w1, inputs) + b1[:, None])
-        hidden = jax.nn.relu(jnp.einsum("ih,ie->he", w2, hidden) + b2[:, None])
-        return jnp.einsum("hk,he->ek", w3, hidden) + b3
-
-    values = [block(*(a[i] for a in kernel)) for i in range(kernel.w1.shape[0])]
-    return jnp.concatenate(values, axis=-1)[:, :outputs]
 
 
 def mc_conv(
@@ -206,7 +145,7 @@ def _convolve(
     def add(tile: _Tile, total: Float[Array, "M K"]) -> Float[Array, "M K"]:
         given = features[tile.sender]
         edges = given, tile.inputs, tile.weight
-        values = combine(_edges_first, kernel, outputs, *edges)
+        values = combine(edges_first, kernel, outputs, *edges)
         return total.at[tile.receiver].add(values, mode="drop")
 
     return _over_tiles(field, add, jnp.zeros((receivers, outputs), features.dtype))
@@ -233,9 +172,7 @@ def _convolve_backward(
         received = cotangent[jnp.minimum(tile.receiver, receivers - 1)]
         received = jnp.where((tile.receiver < receivers)[:, None], received, 0.0)
         _, pull = jax.vjp(
-            lambda k, *edges: combine(
-                _edges_first_to_differentiate, k, outputs, *edges
-            ),
+            lambda k, *edges: combine(edges_first_to_differentiate, k, outputs, *edges),
             *(kernel, features[tile.sender], tile.inputs, tile.weight),
         )
         k, f, x, w = pull(received)

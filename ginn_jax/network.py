@@ -13,7 +13,8 @@ from jaxtyping import Array, Bool, Float
 
 from ginn_jax.architecture import Conv, Network
 from ginn_jax.geometry import Geometry
-from ginn_jax.mcconv import apply_stored, init_kernel, mc_conv, mc_conv_mixing
+from ginn_jax.kernels import init_kernel
+from ginn_jax.mcconv import apply_stored, mc_conv, mc_conv_mixing
 from ginn_jax.receptive_field import Field
 
 SLOPE = 0.2

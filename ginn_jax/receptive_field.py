@@ -102,19 +102,16 @@ def kernel_inputs(
 
 def _pair_inputs(
     oriented: bool, x: Float[Array, "6 E"], y: Float[Array, "6 E"], radius: Array
-) -> Float[Array, "D E"]:
-    """`kernel_inputs` of receivers x and senders y, position above normal."""
-    offset, normal_x, normal_y = (x[:3] - y[:3]) / radius, x[3:], y[3:]
+) -> list[Float[Array, "E"]]:
+    """`kernel_inputs` of receivers x and senders y, position above normal.
+
+    Row by row, sums written out: XLA takes three times as long over whole arrays.
+    """
+    offset = [(a - b) / radius for a, b in zip(x[:3], y[:3], strict=True)]
     if not oriented:
         return offset
-    pairs = (
-        (normal_x, offset),
-        (normal_y, offset),
-        (normal_x, normal_y),
-        (offset, offset),
-    )
-    products = [jnp.sum(a * b, axis=0, keepdims=True) for a, b in pairs]
-    return jnp.concatenate([offset, *products])
+    pairs = (x[3:], offset), (y[3:], offset), (x[3:], y[3:]), (offset, offset)
+    return offset + [a[0] * b[0] + a[1] * b[1] + a[2] * b[2] for a, b in pairs]
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -143,7 +140,8 @@ def _inputs_in_tiles(
             for table, rows in ((receivers, receiver), (senders, sender))
         )
         real = start + jnp.arange(size, dtype=jnp.int32) < count
-        some = jnp.where(real, _pair_inputs(oriented, x, y, radius), 0.0)
+        rows = [jnp.where(real, a, 0.0) for a in _pair_inputs(oriented, x, y, radius)]
+        some = jnp.stack(rows)
         return jax.lax.dynamic_update_slice_in_dim(inputs, some, start, axis=1)
 
     nothing = jnp.zeros((7 if oriented else 3, edges), senders.dtype)
@@ -164,7 +162,7 @@ def _inputs_backward(
     real = jnp.arange(receiver.shape[0], dtype=jnp.int32) < count
 
     def plainly(x: Array, y: Array, radius: Array) -> Float[Array, "D E"]:
-        return _pair_inputs(oriented, x[receiver].T, y[sender].T, radius)
+        return jnp.stack(_pair_inputs(oriented, x[receiver].T, y[sender].T, radius))
 
     _, pull = jax.vjp(plainly, *ends)
     return *pull(jnp.where(real, cotangent, 0.0)), None, None, None

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from strategies import ALL_PAIRS, POINTS, QUERIES, SEEDS, UNIT, lattice, pad
 
+from ginn_jax import kernels
 from ginn_jax import mcconv as mc
 from ginn_jax import receptive_field as rf
 from ginn_jax.packets import radius_edges
@@ -62,7 +63,7 @@ def make_kernel(seed, inputs, values, group):
             rng.normal(size=(blocks, a, b)) / a**0.5,
             rng.normal(size=(blocks, b)),
         ]
-    return mc.Kernel(*(a.astype(np.float32) for a in arrays))
+    return kernels.Kernel(*(a.astype(np.float32) for a in arrays))
 
 
 class Case(NamedTuple):

@@ -32,9 +32,11 @@ def test_quick_keeps_what_the_user_gave():
     assert hasten(options, neighbors.QUICK).queries == neighbors.QUICK["queries"]
 
 
-def test_quick_disks_are_those_of_the_default_network():
-    for radius in poisson_radii.QUICK["radii"]:
-        with_disk_radius(presets.DEFAULT, radius)
+def test_disks_of_the_benchmark_suit_every_network():
+    for effect in (presets.PRESETS, presets.ILLUMINATION, presets.SCATTERING):
+        network = next(iter(effect.values()))
+        for factor in poisson_radii.Options.times:
+            with_disk_radius(network, factor * network.levels[0])
 
 
 def test_pairs_may_differ_at_the_radius_only():
@@ -121,35 +123,6 @@ def test_stages_of_the_step(stage):
     else:
         assert set(second) == set(dict(tiny.ONE_LEVEL_LIMITS.sizes))
         assert isinstance(first[0], tuple) == (stage == "gradient")
-
-
-@pytest.mark.parametrize("trained", [False, True])
-def test_poisson_radii(tmp_path, monkeypatch, trained):
-    stand_in(monkeypatch)
-    config = replace(tiny.CONFIG, network=tiny.ONE_LEVEL)
-    variables = jax.tree.map(np.asarray, untrained(config).variables)
-    record = (config, tiny.ONE_LEVEL_LIMITS, variables)
-    monkeypatch.setattr(poisson_radii, "load_weights", lambda _: record)
-    (tmp_path / "run.json").write_text('{"data": {"radius": 0.2}}')
-    options = poisson_radii.Options(
-        tmp_path / "out",
-        tmp_path if trained else None,
-        shapes=1,
-        radii=(0.08,),
-        points=1200,
-        resolution=32,
-        rays=4,
-        repeats=1,
-    )
-    with tiny.cheap_compiling():
-        metrics = poisson_radii.main(options)
-    assert metrics["occlusion_radius"] == (0.2 if trained else 0.1)
-    assert [row["radius"] for row in metrics["rows"]] == [0.08]
-    assert 0 < metrics["rows"][0]["points"] < 1200
-    text = (tmp_path / "out" / "report.md").read_text()
-    assert ("3D MSE" in text) == trained
-    assert ("Untrained" in text) != trained
-    check_files(tmp_path / "out", "poisson_radii.png")
 
 
 def test_f2d(tmp_path, monkeypatch):
@@ -240,13 +213,13 @@ def test_mistakes_are_input_errors(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="--repeats is 0"):
         train_step.main(train_step.Options(tmp_path, repeats=0))
     with pytest.raises(InputError, match="Poisson radius"):
-        poisson_radii.main(poisson_radii.Options(tmp_path, radii=(7.0,)))
+        poisson_radii.main(poisson_radii.Options(out=tmp_path, times=(7.0,)))
 
 
 def stand_in(monkeypatch):
     """Networks that compile in seconds, untrained, with limits that suffice at once."""
     monkeypatch.setattr(presets, "DEFAULT", tiny.ONE_LEVEL)
-    for module in (f2d, poisson_radii, scaling, train_step):
+    for module in (f2d, scaling, train_step):
         monkeypatch.setattr(module, "init_state", untrained)
     for module in (f2d, scaling):
         monkeypatch.setattr(module, "uniform_limits", lambda *_: tiny.ONE_LEVEL_LIMITS)

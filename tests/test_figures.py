@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tiny
 
+from benchmarks import poisson_radii
 from experiments import animation, environment_maps, evaluate, latent_features
 from ginn_jax import compare_networks, inference, pretrained, train
 from ginn_jax.errors import InputError
@@ -85,6 +86,29 @@ def test_every_light_has_its_error_and_its_picture(tmp_path):
     assert all(row["relative_mse_2d"] > 0 for row in metrics["lights"])
     assert (tmp_path / "lights.png").stat().st_size > 1000
     assert "point light 0" in (tmp_path / "report.md").read_text()
+
+
+@pytest.mark.parametrize("effect", ["ao", "gi"])
+def test_every_disk_radius_has_its_time_and_its_errors(tmp_path, effect):
+    options = poisson_radii.Options(
+        effect,
+        out=tmp_path,
+        objects=1,
+        times=(1.0, 1.25),
+        points=1500,
+        resolution=40,
+        reference=8,
+        looks=8,
+        rounds=2,
+    )
+    fine, coarse = poisson_radii.main(options)["rows"]
+    assert (fine["radius"], coarse["radius"]) == (0.08, 0.1)
+    assert 1200 > fine["points"] > coarse["points"] > 0
+    names = ("mse_3d", "mse_2d", "relative_mse_3d", "relative_mse_2d", "seconds")
+    assert all(row[name] > 0 for name in names for row in (fine, coarse))
+    text = (tmp_path / "report.md").read_text()
+    assert "those that come with the package" in text
+    assert (tmp_path / "poisson_radii.png").stat().st_size > 1000
 
 
 @pytest.mark.parametrize("effect", ["ao", "gi"])

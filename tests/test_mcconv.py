@@ -23,6 +23,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from strategies import POINTS, QUERIES, UNIT
 
+from ginn_jax import kernels
 from ginn_jax import mcconv as mc
 from ginn_jax import receptive_field as rf
 
@@ -139,7 +140,7 @@ def test_convolution_equals_the_formula(variant, mixes, group, case):
 
 @pytest.mark.parametrize(("outputs", "group", "blocks"), [(7, 3, 3), (6, 6, 1)])
 def test_new_kernels_are_scaled_to_their_inputs(outputs, group, blocks):
-    kernel = mc.init_kernel(200, outputs, 100, group, key=jax.random.key(0))
+    kernel = kernels.init_kernel(200, outputs, 100, group, key=jax.random.key(0))
     shapes = [a.shape[1:] for a in kernel]
     assert {len(a) for a in kernel} == {blocks}
     assert shapes == [(200, 100), (100,), (100, 100), (100,), (100, group), (group,)]
