@@ -14,7 +14,15 @@ from jaxtyping import Float
 from ginn_jax.architecture import Network
 from ginn_jax.camera import Camera, orbit_camera
 from ginn_jax.dataset import count_asked
-from ginn_jax.evaluate import Image, Model, Row, at_scale, fill, timed, timed_network
+from ginn_jax.evaluate import (
+    Image,
+    Model,
+    Row,
+    at_scale,
+    fill,
+    timed,
+    timed_network,
+)
 from ginn_jax.image import Encoded, shade_image
 from ginn_jax.inference import encode_cloud, shade_points
 from ginn_jax.irradiance import ColorEstimate
@@ -87,6 +95,8 @@ def evaluate_lit_clouds(
         errors = unit_errors(encoded, asked, np.maximum(values, 0.0))
         rows.append({"name": name, "points": int(np.sum(encoded.points.mask))} | errors)
         rows[-1]["ray_variance"] = rows[-1]["noise_floor_3d"] * settings.paths
+        medium = zip(("extinction", "ior"), cloud.medium.tolist(), strict=False)
+        rows[-1] |= dict(medium)
     return rows, limits
 
 

@@ -4,6 +4,7 @@ On disk a point takes 35 bytes: its position as it is, its normal by octahedral
 coordinates of 16 bits, light by half-precision numbers in units of their mean.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -80,6 +81,16 @@ def network_numbers(
 def mean_light(cloud: LitCloud) -> Float[np.ndarray, "3"]:
     """Mean of the light that the network takes, the unit of each channel."""
     return network_numbers(cloud)[1][..., 0].mean(axis=1)
+
+
+def unit_floor(clouds: Sequence[LitCloud]) -> float:
+    """Mean noise of the targets in the unit of the training loss."""
+    floors = []
+    for cloud in clouds:
+        scale = mean_light(cloud)
+        lit = scale > 0
+        floors += (cloud.variance.mean(axis=0)[lit] / scale[lit] ** 2).tolist()
+    return float(np.mean(floors))
 
 
 def split_points(cloud: LitCloud, count: int) -> tuple[LitCloud, LitCloud]:

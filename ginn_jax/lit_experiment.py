@@ -24,8 +24,8 @@ from ginn_jax.experiment import (
     training,
 )
 from ginn_jax.lighting import find_environments
-from ginn_jax.lit_clouds import LitCloud, mean_light, split_points
-from ginn_jax.lit_report import write_report
+from ginn_jax.lit_clouds import LitCloud, split_points, unit_floor
+from ginn_jax.lit_report import halves_by_medium, write_report
 from ginn_jax.lit_scenes import Illumination, Scattering
 from ginn_jax.mesh import find_meshes
 from ginn_jax.metrics import relative_error
@@ -161,16 +161,6 @@ def paper_sources(
     return seen, {"validation": validation, "test": test}
 
 
-def unit_floor(clouds: Sequence[LitCloud]) -> float:
-    """Mean noise of the targets in the unit of the training loss."""
-    floors = []
-    for cloud in clouds:
-        scale = mean_light(cloud)
-        lit = scale > 0
-        floors += (cloud.variance.mean(axis=0)[lit] / scale[lit] ** 2).tolist()
-    return float(np.mean(floors))
-
-
 def evaluation(
     options: LitOptions,
     run: fit.Fit,
@@ -182,7 +172,7 @@ def evaluation(
     """All errors of the trained network; draws the figures."""
     variables = jax.device_put(run.state.variables, jax.devices()[0])
     model = Model(variables, jax.random.key(options.seed))
-    limits, metrics = run.limits, {}
+    limits, metrics, each = run.limits, {}, []
     for name, sources in unseen.items():
         names = [source.name for source in sources]
         rows, limits = evaluate_light.evaluate_lit_clouds(
@@ -190,6 +180,8 @@ def evaluation(
         )
         pooled = pool_rows(rows)
         metrics |= {f"unseen {name}": pooled, f"unseen {name}, each": rows}
+        each += rows
+    metrics |= halves_by_medium(each)
     firsts = (list(zip(unseen[n], clouds[n], strict=True))[:2] for n in unseen)
     shown = [pair for pairs in firsts for pair in pairs][:6]
     images = image_evaluation(options, config, limits, model, settings, shown)

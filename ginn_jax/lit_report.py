@@ -1,8 +1,24 @@
 """report.md of the experiments of effects that carry light."""
 
+from collections.abc import Sequence
 from typing import Any
 
 from ginn_jax import report
+from ginn_jax.evaluate import Row, pool_rows
+
+
+def halves_by_medium(rows: Sequence[Row]) -> dict[str, Row]:
+    """Errors pooled over the clearer half of the media and over the denser, if any."""
+    media = sorted(
+        (row for row in rows if "extinction" in row), key=lambda row: row["extinction"]
+    )
+    half = len(media) // 2
+    halves = {"clearer": media[:half], "denser": media[half:]}
+    return {
+        f"unseen, {name} half of the media": pool_rows(part)
+        for name, part in halves.items()
+        if half
+    }
 
 
 def write_report(title: str, m: dict[str, Any]) -> str:
@@ -14,7 +30,7 @@ def write_report(title: str, m: dict[str, Any]) -> str:
     sets = [
         {"set": name, **m[name]}
         for name in m
-        if name.startswith("unseen ") and not name.endswith("each")
+        if name.startswith("unseen") and not name.endswith("each")
     ]
     times = {"method": "method", "relative_mse_2d": "relative 2D MSE"}
     times |= {"mse_2d": "2D MSE", "dssim_2d": "DSSIM", "seconds_3d": "f_3D s"}
@@ -26,6 +42,10 @@ def write_report(title: str, m: dict[str, Any]) -> str:
     }
     each |= {"noise_floor_3d": "noise floor", "variance_3d": "variance"}
     rows = [r for name in m if name.endswith(", each") for r in m[name]]
+    media = ""
+    if any("extinction" in row for row in rows):
+        each |= {"extinction": "extinction", "ior": "index of refraction"}
+        media = "Extinction is per longest side of the object.\n\n"
     seconds = {k[8:]: v for k, v in m.items() if k.startswith("seconds_")}
     network = m["training"]["network"]
     kind = "linear in light" if network["linear"] else "homogeneous in light"
@@ -66,4 +86,4 @@ displayed, after the paper's tone mapping, over the foreground.
 {report.markdown_table(list(seconds), [[f"{v:.1f} s" for v in seconds.values()]])}
 ## Every unseen object
 
-{report.table_of(rows, each)}"""
+{media}{report.table_of(rows, each)}"""

@@ -57,11 +57,25 @@ def test_a_small_run_leaves_all_that_is_promised(effect, tmp_path, monkeypatch):
     assert paths[0] > paths[-1]
     for name in ("learning_curve", "views", "error_against_time"):
         assert (tmp_path / f"{name}.png").stat().st_size > 1000
-    assert "unseen point lights" in (tmp_path / "report.md").read_text()
+    text = (tmp_path / "report.md").read_text()
+    assert "unseen point lights" in text
+    assert ("denser half of the media" in text) == (effect == "sss")
     if effect == "gi":
         return
+    rows = [
+        row for name in ("shapes", "point lights") for row in media_of(metrics, name)
+    ]
+    clear = metrics["unseen, clearer half of the media"]
+    two = sorted(rows)[:2]
+    assert clear["mse_3d"] == pytest.approx(np.mean([error for _, error in two]))
     with pytest.raises(InputError, match="--size"):
         script.main(replace(options, size=0.0))
+
+
+def media_of(metrics, name):
+    """Extinction and error of every scene of a set."""
+    rows = metrics[f"unseen {name}, each"]
+    return [(row["extinction"], row["mse_3d"]) for row in rows]
 
 
 def test_seen_and_unseen_share_no_object_and_no_light(tmp_path):
