@@ -81,9 +81,10 @@ def shade_image(
 
     def compute(wanted: Bool[np.ndarray, "H W"], limits: Limits) -> Limits:
         rows = pixel[wanted.reshape(-1)[pixel]]
-        ends = (np.asarray(a).reshape(-1, 3)[rows] for a in (position, normal))
+        # `take` is three times as fast here as an index.
+        ends = (np.reshape(a, (-1, 3)).take(rows, axis=0) for a in (position, normal))
         more = (
-            None if a is None else np.reshape(a, (len(a), mask.size, -1))[:, rows]
+            a if a is None else np.reshape(a, (len(a), mask.size, -1)).take(rows, 1)
             for a in (material, light)
         )
         arrays = network, limits, variables, encoded
