@@ -119,12 +119,16 @@ def compare(
         network, limits, variables, cloud.position, cloud.normal, key=key
     )
     pixels = gbuffer.position, gbuffer.normal, gbuffer.mask
-    _, limits = image.shade_image(network, limits, variables, encoded, *pixels)
+    ends = variables, encoded, *pixels
+
+    def shade(limits: Limits, scale: float) -> tuple[np.ndarray, Limits]:
+        return image.shade_image(network, limits, *ends, resolution_scale=scale)
+
+    # Pixels further apart need more room.
+    fitting = {scale: shade(limits, scale)[1] for scale in (1.0, *options.scales)}
 
     def ours(scale: float = 1.0) -> Any:
-        return image.shade_image(
-            network, limits, variables, encoded, *pixels, resolution_scale=scale
-        )[0]
+        return shade(fitting[scale], scale)[0]
 
     mask = gbuffer.mask
     place, normal = (jnp.asarray(a[mask]) for a in pixels[:2])
@@ -151,7 +155,7 @@ def compare(
         "pixels": int(mask.sum()),
         "edges": int(plain()[2]),
         "difference": difference,
-        "block_bytes": block_memory(network, limits, variables, encoded),
+        "block_bytes": block_memory(network, fitting[1.0], variables, encoded),
         "timings": timings,
     }
 
