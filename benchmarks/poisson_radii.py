@@ -6,7 +6,7 @@ One set of weights, one object after the other, radii in turns.
 """
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,18 +20,17 @@ from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, require_positive, start
 from ginn_jax.compare_networks import (
     Trained,
+    at_disk_radius,
     errors_at_points,
     load_trained,
     network_picture,
     points_given,
 )
 from ginn_jax.compare_tracing import trace
-from ginn_jax.dataset import count_asked
-from ginn_jax.disk_radius import limits_at, with_disk_radius
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Row
 from ginn_jax.objects import Source
-from ginn_jax.scenes import Occlusion, Settings, cloud_path, make_cloud, read_cloud
+from ginn_jax.scenes import Settings, cloud_path, make_cloud, read_cloud
 
 TIMES = "seconds_3d", "seconds_2d", "seconds"
 
@@ -85,9 +84,7 @@ def main(options: Options) -> dict[str, Any]:
     begin = time.perf_counter()
     counts = options.points, options.reference
     settings = compare.effect_settings(options.effect, *counts, options.radius)
-    if not isinstance(settings, Occlusion):
-        targets = count_asked(settings.points)
-        settings = replace(settings, looks=options.looks, targets=targets)
+    settings = compare.with_looks(settings, options.looks)
     trained = load_trained(
         options.effect, settings, options.checkpoint, key=jax.random.key(0)
     )
@@ -114,13 +111,8 @@ def main(options: Options) -> dict[str, Any]:
 
 def at_radii(trained: Trained, times: tuple[float, ...]) -> dict[str, Trained]:
     """The network at each of the Poisson disk radii."""
-    network, limits, model = trained
-    networks = {}
-    for factor in times:
-        radius = round(factor * network.levels[0], 6)
-        variant = with_disk_radius(network, radius)
-        networks[f"{radius:g}"] = variant, limits_at(network, limits, radius), model
-    return networks
+    radii = (round(factor * trained[0].levels[0], 6) for factor in times)
+    return {f"{radius:g}": at_disk_radius(trained, radius) for radius in radii}
 
 
 def compare_radii(

@@ -7,7 +7,7 @@ tracing and (where mitsuba_oidn is installed) denoised path tracing, on scenes t
 network was trained on. `--help` lists every option with its default.
 """
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +22,7 @@ from ginn_jax.compare import Shot
 from ginn_jax.compare_networks import (
     OURS,
     Trained,
+    at_disk_radius,
     errors_at_points,
     load_networks,
     network_memory,
@@ -30,12 +31,11 @@ from ginn_jax.compare_networks import (
 )
 from ginn_jax.compare_screen import screen_pictures
 from ginn_jax.compare_tracing import denoised_picture, traced_picture, with_reference
-from ginn_jax.dataset import count_asked, count_given
-from ginn_jax.disk_radius import limits_at, with_disk_radius
+from ginn_jax.dataset import count_given
 from ginn_jax.evaluate import Row
 from ginn_jax.experiment import make
 from ginn_jax.objects import Source
-from ginn_jax.scenes import Occlusion, Settings, cloud_origin
+from ginn_jax.scenes import Settings, cloud_origin
 
 TITLES = {"ao": "Ambient occlusion", "gi": "Global illumination"}
 TITLES |= {"sss": "Subsurface scattering"}
@@ -104,9 +104,7 @@ def main(options: Options) -> dict[str, Any]:
     runs = options.checkpoint, options.only_2d, options.only_3d
     key = jax.random.key(options.seed)
     networks = load_networks(options.effect, settings, runs, key=key)
-    if not isinstance(settings, Occlusion):
-        targets = count_asked(settings.points)
-        settings = replace(settings, looks=options.looks, targets=targets)
+    settings = compare.with_looks(settings, options.looks)
     clouds = make(console, "clouds", sources, settings, options.out / "clouds")
     at_points, networks = errors_at_points(networks, clouds, sources, settings)
     rows, front_rows, shown = [], [], []
@@ -182,17 +180,16 @@ def rivals(
     units: np.ndarray | None,
 ) -> list[Row]:
     """Our network at other rates and radii, and tracing, plain and denoised."""
-    network, limits, model = networks[OURS]
+    trained = networks[OURS]
     picture, networks[OURS] = network_picture(
-        "ours, scale 0.5", networks[OURS], given, shot, 0.5
+        "ours, scale 0.5", trained, given, shot, 0.5
     )
     rows = [picture.row]
     for times in options.disks:
-        radius = times * network.levels[0]
-        variant = with_disk_radius(network, radius)
-        trained = variant, limits_at(network, limits, radius), model
+        radius = times * trained[0].levels[0]
+        variant = at_disk_radius(trained, radius)
         name = f"ours, disk {radius:.3g}"
-        rows.append(network_picture(name, trained, given, shot)[0].row)
+        rows.append(network_picture(name, variant, given, shot)[0].row)
     for count in options.counts:
         seed = 1_000_003 + options.seed
         noisy = traced_picture(shot, settings, count, units, seed=seed)

@@ -4,6 +4,7 @@ A shot is one scene under one camera, of ambient occlusion (`View`) or of light
 (`LitView`). A method makes a picture of it: a row of numbers and the foreground values.
 """
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +14,7 @@ from jaxtyping import Float
 
 from ginn_jax import evaluate, evaluate_light
 from ginn_jax.camera import Camera
+from ginn_jax.dataset import count_asked
 from ginn_jax.evaluate import Row, View
 from ginn_jax.evaluate_light import LitView
 from ginn_jax.irradiance import ColorEstimate
@@ -151,3 +153,11 @@ def effect_settings(
         "sss": Scattering,
     }
     return kinds[effect](points or SAMPLES[effect], paths)
+
+
+def with_looks(settings: Settings, looks: int) -> Settings:
+    """Settings of clouds to compare on: where there is light it is looked at so often,
+    and only the points that are asked have targets."""
+    if isinstance(settings, Occlusion):
+        return settings
+    return replace(settings, looks=looks, targets=count_asked(settings.points))

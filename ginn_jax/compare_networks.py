@@ -14,6 +14,7 @@ from ginn_jax.architecture import Network
 from ginn_jax.checkpoint import RECORD, damaged, read_record
 from ginn_jax.compare import Picture, Shot, Values, of_variance, scratch_mib
 from ginn_jax.dataset import ShadedPoints, count_given
+from ginn_jax.disk_radius import limits_at, with_disk_radius
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model, Row, View
 from ginn_jax.evaluate_light import LitView
@@ -73,6 +74,13 @@ def load_trained(
     if isinstance(settings, Occlusion):
         check_radius(name, learned_from(name, run), settings.radius)
     return config.network, limits, Model(weights, key)
+
+
+def at_disk_radius(trained: Trained, radius: float) -> Trained:
+    """The same network on a finest level of another Poisson disk radius."""
+    network, limits, model = trained
+    variant = with_disk_radius(network, radius)
+    return variant, limits_at(network, limits, radius), model
 
 
 def learned_from(name: str, run: Path | None) -> dict[str, Any]:
