@@ -79,7 +79,7 @@ def main(options: Options) -> dict[str, Any]:
     clock = Clock()
     settings = scenes.Occlusion(options.points, options.rays, options.radius)
     train_sources = training_sources(options)
-    test_sources = unseen_sources(options)
+    test_sources = held_back_sources(options)
     begin = time.perf_counter()
     folder = options.out / "data"
     clouds = make(
@@ -117,7 +117,7 @@ def training_sources(options: Options) -> list[objects.Source]:
     return sources
 
 
-def unseen_sources(options: Options) -> list[objects.Source]:
+def held_back_sources(options: Options) -> list[objects.Source]:
     """Procedural shapes of other seeds, and the user's test meshes."""
     sources = objects.procedural_sources(
         options.test_shapes, objects.UNSEEN_SEED + options.seed
