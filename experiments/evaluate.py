@@ -23,6 +23,7 @@ from ginn_jax.compare_networks import (
     OURS,
     Trained,
     at_disk_radius,
+    codes_kept,
     errors_at_points,
     load_networks,
     network_memory,
@@ -40,6 +41,7 @@ from ginn_jax.scenes import Settings, cloud_origin
 TITLES = {"ao": "Ambient occlusion", "gi": "Global illumination"}
 TITLES |= {"sss": "Subsurface scattering"}
 TARGET_PATHS = 1024
+HALF_RATE = f"{OURS}, scale 0.5"
 
 
 @dataclass(frozen=True)
@@ -168,6 +170,9 @@ def compare_scene(
             shown = compare.displayed(shot, pictures)
             front += [p.row for p in pictures]
             front += rivals(options, settings, shot, given, networks, units)
+            front += [
+                codes_kept(row) for row in front if row["method"] in (OURS, HALF_RATE)
+            ]
     return rows, front, shown, networks
 
 
@@ -181,9 +186,7 @@ def rivals(
 ) -> list[Row]:
     """Our network at other rates and radii, and tracing, plain and denoised."""
     trained = networks[OURS]
-    picture, networks[OURS] = network_picture(
-        "ours, scale 0.5", trained, given, shot, 0.5
-    )
+    picture, networks[OURS] = network_picture(HALF_RATE, trained, given, shot, 0.5)
     rows = [picture.row]
     for times in options.disks:
         radius = times * trained[0].levels[0]

@@ -127,7 +127,8 @@ f_2D takes {m["share_2d"]:.0%} of our network's time (paper: 60 %).
 
 ## Error against run time
 
-Over the first view of every scene.{denoiser}
+Over the first view of every scene.{denoiser} Codes kept: the time of another view of
+the same scene in the same light, f_2D alone.
 
 {report.table_of(m["error_against_time"], against)}
 Pareto front by 2D MSE: {", ".join(m["front_mse"])}.

@@ -135,6 +135,9 @@ def test_light_is_compared_with_tracing_plain_and_denoised(tmp_path, monkeypatch
     found = experiment.main(options)
     rows = {row["method"]: row for row in found["error_against_time"]}
     assert {"ours, disk 0.06", "ours, scale 0.5", "3D only"} <= set(rows)
+    kept = rows["ours, codes kept"]
+    assert kept["mse_2d"] == rows[OURS]["mse_2d"]
+    assert kept["seconds"] == rows[OURS]["seconds_2d"] < rows[OURS]["seconds"]
     plain, denoised = rows["2 paths"], rows["2 paths, denoised"]
     assert denoised["mse_2d"] == pytest.approx(plain["mse_2d"], rel=1e-5)
     assert denoised["seconds"] > plain["seconds"]
