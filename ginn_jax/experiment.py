@@ -44,13 +44,13 @@ class RunOptions:
     points: int = 20_000
     """Samples per object."""
     schedule: Literal["cosine", "paper"] = "cosine"
-    """Learning rate: warm-up and cosine decay, or the paper's x0.7 every 10 epochs."""
+    """Muon with warm-up and cosine decay, or the paper's Adam, x0.7 every 10 epochs."""
     steps: int = 3000
     """Training steps."""
     batch: int = 2
     """Clouds per step (the paper: 8)."""
     learning_rate: float = 0.005
-    """Adam's learning rate at its highest."""
+    """The optimizer's learning rate at its highest."""
     resolution: int = 256
     """Side of the evaluation images in pixels."""
     resolution_scale: float = 0.5
