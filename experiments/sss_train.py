@@ -26,6 +26,8 @@ class Options(LitOptions):
     """Folder for data, checkpoints, metrics.json, report.md and figures."""
     preset: Preset = "homogeneous"
     """Homogeneous in light, exactly linear, the authors' table, or an ablation."""
+    paths: int = 16
+    """Paths per training point."""
     size: float = 100.0
     """Longest side of the objects in mm."""
     absorption: float = 0.1

@@ -61,6 +61,8 @@ class Network:
                 act, so that the output is exactly linear in light
     local       whether the light at a query and near it also reaches the output on a
                 linear path, scaled by features: normalised features forget magnitude
+    beams       channels beside the features on which light passes all levels by linear
+                maps alone, scaled by features: what an area sends on is a sum over it
     asks        what f_2D sees of a query: its "normal", or "all" its attributes
     splat       whether points are shaded, and their shading only blended at queries
     """
@@ -80,6 +82,7 @@ class Network:
     lights: int = 0
     linear: bool = False
     local: bool = False
+    beams: int = 0
     asks: Literal["normal", "all"] = "normal"
     splat: bool = False
 
@@ -93,7 +96,7 @@ class Network:
             positive("level", radius)
         for name, least in (("latent", 1), ("head", 1), ("hidden", 1), ("group", 0)):
             whole(name, getattr(self, name), least, WIDEST)
-        for name in ("materials", "lights"):
+        for name in ("materials", "lights", "beams"):
             whole(name, getattr(self, name), 0, WIDEST)
         one_of("density", self.density, ("kde", "surface"))
         one_of("norm", self.norm, ("batch", "layer", "none"))

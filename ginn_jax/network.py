@@ -44,8 +44,8 @@ class Norm(nn.Module):
 class Code(NamedTuple):
     """What a point carries: `free` features, and `light` ones, linear in the light.
 
-    Networks that are not linear have no `light` inside f_3D: it came in among the
-    attributes. `local` ones hand the point's own on to f_2D.
+    Networks that are neither linear nor have beams have no `light` inside f_3D: it came
+    in among the attributes. `local` ones hand the point's own on to f_2D.
     """
 
     free: Float[Any, "N K"]
@@ -58,7 +58,8 @@ def enter(
     """Attributes and light as the network takes them."""
     if light is None or network.linear:
         return attributes, light
-    return jnp.concatenate([attributes, light], axis=1), None
+    both = jnp.concatenate([attributes, light], axis=1)
+    return both, light if network.beams else None
 
 
 def join(*codes: Code) -> Code:
@@ -101,7 +102,7 @@ class McConv(nn.Module):
             free = nn.Dense(conv.channels)(free)
             free = Norm(network.norm, self.train)(free, mask)
             if light is not None:
-                light = Gate(conv.channels)(free, light)
+                light = Gate(network.beams or conv.channels)(free, light)
         both = free if light is None else jnp.concatenate([free, light], axis=1)
         kernels = conv.channels * free.shape[1] if conv.mixes else both.shape[1]
         kernel = self.param(
@@ -154,12 +155,13 @@ class Encoder(nn.Module):
             free = Norm(network.norm, self.train)(free, levels[0].mask)
         free = nn.Dense(network.latent, name="latent")(free)
         free = Norm(network.norm, self.train)(free, levels[0].mask)
+        beams = []
         if x.light is not None:
-            return Code(free, self._dim(free, x.light))
-        return Code(free, light if network.local else None)
-
-    def _dim(self, free: Array, light: Array) -> Array:
-        return Gate(self.network.latent, name="latent_light")(free, light)
+            width = network.beams or network.latent
+            beams = [Gate(width, name="latent_light")(free, x.light)]
+        if network.local and light is not None:
+            beams = [light, *beams]
+        return Code(free, jnp.concatenate(beams, axis=1) if beams else None)
 
 
 def splat(values: Float[Array, "N"], field: Field, receivers: int) -> Float[Array, "M"]:

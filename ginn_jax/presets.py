@@ -147,7 +147,7 @@ def for_light(network: Network) -> dict[str, Network]:
     """The presets of an effect that carries light; the first is its default."""
     return {
         "homogeneous": network,
-        "linear": replace(network, linear=True, local=False),
+        "linear": replace(network, linear=True, local=False, beams=0),
         "released": replace(
             RELEASED,
             lights=1,
@@ -163,4 +163,4 @@ ILLUMINATION = for_light(_DIFFUSE)
 
 
 # Albedo, extinction and index of refraction, and the irradiance.
-SCATTERING = for_light(replace(_DENSE, materials=3, asks="all", local=True))
+SCATTERING = for_light(replace(_DENSE, materials=3, asks="all", local=True, beams=8))

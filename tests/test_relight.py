@@ -21,10 +21,10 @@ EFFECTS = {
     "linear": replace(tiny.NETWORK, linear=True, materials=3, lights=1, asks="all"),
     "illumination": replace(tiny.ONE_LEVEL, linear=True, materials=1, lights=1),
     "homogeneous": replace(tiny.ONE_LEVEL, materials=1, lights=1),
-    "local": LOCAL,
+    "beams": replace(LOCAL, beams=2),
     "only_2d": only_2d(LOCAL),
     "only_3d": only_3d(
-        replace(tiny.NETWORK, materials=3, lights=1, asks="all", local=True)
+        replace(tiny.NETWORK, materials=3, lights=1, asks="all", local=True, beams=2)
     ),
 }
 
@@ -141,3 +141,24 @@ def test_relighting_is_shading(case):
         ]
         expected = np.maximum(shade(network, variables, *lights), 0)
         close(relight(network, variables, ready, *lights), expected)
+
+
+def test_beams_are_linear_once_features_are_blind_to_light():
+    network = EFFECTS["beams"]
+    config = replace(tiny.CONFIG, network=network)
+    variables = jax.device_get(train.init_state(config).variables)
+    first = variables["encoder"]["params"][network.encoder[0].name]["Dense_0"]
+    first["kernel"] = np.concatenate([first["kernel"][:-1], 0 * first["kernel"][-1:]])
+    rng, cloud = np.random.default_rng(3), lit(1000, 1, (8.0, 1.3))
+
+    def carried(irradiance):
+        numbers = network_numbers(cloud._replace(irradiance=irradiance))
+        ends = variables, cloud.position, cloud.normal, *numbers
+        given = network, limits_of(network), *ends
+        encoded, _ = inference.encode_cloud(*given, key=KEY)
+        assert encoded.code.light.shape[-1] == 1 + network.beams
+        return np.asarray(encoded.code.light) * np.asarray(encoded.scale)[:, None, None]
+
+    one, two = rng.gamma(0.3, size=(2, *cloud.irradiance.shape)).astype(np.float32)
+    close(carried(one) + carried(two), carried(one + two))
+    assert np.abs(carried(one)[..., 1:]).min(axis=-1).max() > 0
