@@ -49,8 +49,8 @@ class RunOptions:
     """Training steps."""
     batch: int = 2
     """Clouds per step (the paper: 8)."""
-    learning_rate: float = 0.005
-    """The optimizer's learning rate at its highest."""
+    learning_rate: float = 0.01
+    """The learning rate at its highest (the paper: .005)."""
     resolution: int = 256
     """Side of the evaluation images in pixels."""
     resolution_scale: float = 0.5

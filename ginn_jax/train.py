@@ -41,7 +41,7 @@ class Training:
     batch_size: int = 2
     points: int = 16384
     queries: int = 4096
-    learning_rate: float = 5e-3
+    learning_rate: float = 0.01
     schedule: str = "cosine"
     warm_up: int = 100
     clip_norm: float = 1.0
