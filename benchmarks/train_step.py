@@ -29,6 +29,7 @@ from ginn_jax.limits import Limits
 from ginn_jax.network import Variables
 from ginn_jax.objective import batch_loss, split_variables
 from ginn_jax.process import ALONE, available_cores
+from ginn_jax.room import training_room
 from ginn_jax.train import (
     Training,
     TrainState,
@@ -161,13 +162,13 @@ def profile(
 
 
 def make_batch(options: Options, config: Training) -> tuple[ShadedPoints, Limits]:
-    """Procedural clouds, as training has them, and the limits it would measure."""
+    """Procedural clouds, as training has them, and the limits most steps would take."""
     settings = scenes.Occlusion(points=options.points * 5 // 4, rays=16)
     sources = objects.procedural_sources(options.shapes, 0)
     folder, workers = options.out / "data", min(available_cores(), options.shapes)
     list(scenes.make_clouds(sources, settings, folder, workers))
     clouds = scenes.read_clouds(sources, settings, folder)
-    return fit.step_batch(config, clouds, 0), fit.training_limits(config, clouds)
+    return fit.step_batch(config, clouds, 0), training_room(config, clouds).usual
 
 
 def main(options: Options) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from ginn_jax.errors import InputError
 from ginn_jax.files import unwritable, writing
 from ginn_jax.limits import Limits
 from ginn_jax.network import Variables
+from ginn_jax.room import Room
 from ginn_jax.searches import limit_names
 from ginn_jax.train import Training, TrainState, state_shapes
 
@@ -126,13 +127,13 @@ def _shape_of(leaf: Any) -> jax.ShapeDtypeStruct:
 def save_run(
     folder: Path,
     config: Training,
-    limits: Limits,
+    room: Room,
     extra: dict[str, Any],
     seconds: Mapping[str, float] = UNSPENT,
 ) -> None:
     """Write what a resumed run must agree with, its capacities and the time spent."""
-    record = {"training": asdict(config), "limits": dict(limits.sizes), **extra}
-    record["seconds"] = dict(seconds)
+    record = {"training": asdict(config), "seconds": dict(seconds), **extra}
+    record |= {"limits": dict(room.most.sizes), "usual": dict(room.usual.sizes)}
     text = json.dumps(record, indent=1, sort_keys=True)
     with writing(folder / RECORD) as new:
         new.write_text(text)
@@ -140,7 +141,7 @@ def save_run(
 
 def load_run(
     folder: Path, config: Training, extra: dict[str, Any]
-) -> tuple[Limits, dict[str, float]]:
+) -> tuple[Room, dict[str, float]]:
     """Capacities of the run to be resumed, and the seconds it took by purpose.
 
     Raises:
@@ -150,7 +151,7 @@ def load_run(
     record = read_record(path, "no run to resume: leave out --resume")
     with damaged(path, "delete it and start anew"):
         training = dict(record["training"])
-        limits = limits_from(record)
+        room = Room(limits_from(record, "usual"), limits_from(record))
         spent = record.get("seconds", UNSPENT)
         seconds = {name: float(spent[name]) for name in UNSPENT}
     wanted = json.loads(json.dumps({"training": asdict(config), **extra}))
@@ -164,8 +165,9 @@ def load_run(
             raise InputError(
                 f"{path} was made with another {name}: resume with the same"
             )
-    check_names(path, config.network, limits)
-    return limits, seconds
+    for limits in room.each():
+        check_names(path, config.network, limits)
+    return room, seconds
 
 
 def check_names(path: Path, network: Network, limits: Limits) -> None:
@@ -226,9 +228,9 @@ def damaged(path: Path, mend: str) -> Iterator[None]:
         raise InputError(f"{path} is damaged: {mend}") from None
 
 
-def limits_from(record: dict[str, Any]) -> Limits:
+def limits_from(record: dict[str, Any], name: str = "limits") -> Limits:
     """The capacities that `save_run` wrote."""
-    sizes = record["limits"].items()
+    sizes = record[name].items()
     return Limits(tuple((name, whole(name, n, 1, LARGEST_INDEX)) for name, n in sizes))
 
 

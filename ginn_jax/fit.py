@@ -1,6 +1,7 @@
 """The training loop of a run: clouds in, weights out, resumable at any step."""
 
 import io
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,22 +24,17 @@ from ginn_jax.checkpoint import (
 from ginn_jax.dataset import ShadedPoints, batch_order, stack_clouds
 from ginn_jax.errors import InputError
 from ginn_jax.files import writing
-from ginn_jax.limits import SLACK, Limits, exceeded, measure_limits, widened
+from ginn_jax.limits import Limits, exceeded
 from ginn_jax.lit_clouds import Cloud, channel_of
 from ginn_jax.network import Variables
 from ginn_jax.process import forget_programs
-from ginn_jax.searches import uniform_limits
+from ginn_jax.room import Room, training_room, with_more
 from ginn_jax.train import (
     Training,
     TrainState,
-    batch_mesh,
     init_state,
-    probe_step,
-    share_key,
     train_step,
 )
-
-PROBES = 300
 
 
 @dataclass(frozen=True)
@@ -77,8 +73,8 @@ def fit(
 ) -> Fit:
     """Train to `config.steps` from `weights` or random ones, saving under `folder`.
 
-    Where a batch needs more than a limit the limit is raised and the step repeated, on
-    the state it started from. `progress(step, loss, note)` hears of every report.
+    Where a batch needs more than there is room for, more is made and the step repeated,
+    on the state it started from. `progress(step, loss, note)` hears of every report.
 
     Raises:
         InputError: too few points per cloud, or nothing to resume.
@@ -87,35 +83,36 @@ def fit(
     folder.mkdir(parents=True, exist_ok=True)
     begin, extra = time.perf_counter(), extra or {}
     if resume:
-        limits, seconds = load_run(folder, config, extra)
+        room, seconds = load_run(folder, config, extra)
     else:
-        limits, seconds = training_limits(config, clouds), dict(UNSPENT)
-        save_run(folder, config, limits, extra, seconds)
+        room, seconds = training_room(config, clouds), dict(UNSPENT)
+        save_run(folder, config, room, extra, seconds)
     manager = open_manager(folder, fresh=not resume)
     state, history = latest(manager, folder, init_state(config, weights), resume)
     seconds["compile"] += time.perf_counter() - begin
-    compiled_for, raised = None, dict[str, int]()
+    compiled, raised = set[Limits](), dict[str, int]()
     while (step := int(state.step)) < config.steps:
         begin = time.perf_counter()
-        state, loss, wider = step_with_room(config, limits, clouds, state)
-        purpose = "train" if compiled_for == wider else "compile"
+        state, loss, used, wider = step_with_room(config, room, clouds, state)
+        purpose = "train" if used in compiled else "compile"
         seconds[purpose] += time.perf_counter() - begin
-        if wider != limits:
-            more = {n: size for n, size in wider.sizes if size > limits.of(n)}
+        if used is None:
+            more = {n: size for n, size in wider.most.sizes if size > room.most.of(n)}
             progress(step, loss, f"raised {', '.join(more)}")
-            limits, raised = wider, raised | more
+            room, raised = wider, raised | more
+            compiled.clear()
             forget_programs()
             continue
-        compiled_for = limits
+        compiled.add(used)
         history.append(loss)
         if (step + 1) % schedule.report == 0:
             progress(step + 1, recent_loss(history, schedule.report), "")
         if (step + 1) % schedule.save == 0 or step + 1 == config.steps:
             save_losses(folder, history)
-            save_run(folder, config, limits, extra, seconds)
+            save_run(folder, config, room, extra, seconds)
             save_state(manager, state)
     finish(manager)
-    return Fit(state, limits, np.array(history, np.float32), seconds, raised)
+    return Fit(state, room.most, np.array(history, np.float32), seconds, raised)
 
 
 def latest(
@@ -128,18 +125,19 @@ def latest(
 
 
 def step_with_room(
-    config: Training, limits: Limits, clouds: Sequence[Cloud], state: TrainState
-) -> tuple[TrainState, float, Limits]:
-    """A step, its loss and the same limits; or the same state and limits to repeat it.
+    config: Training, room: Room, clouds: Sequence[Cloud], state: TrainState
+) -> tuple[TrainState, float, Limits | None, Room]:
+    """A step, its loss, the limits it took; or None of those and room to repeat it in.
 
     The state given is used up either way.
     """
-    step = int(state.step)
+    step, short = int(state.step), {}
     batch = step_batch(config, clouds, step)
-    state, report = train_step(config, limits, state, batch)
-    if short := exceeded(limits, jax.device_get(report.demands)):
-        limits = widened(limits, batch_limits(config, batch, step), short)
-    return state, float(report.loss), limits
+    for limits in room.each():
+        state, report = train_step(config, limits, state, batch)
+        if not (short := exceeded(limits, jax.device_get(report.demands))):
+            return state, float(report.loss), limits, room
+    return state, math.nan, None, with_more(room, config, batch, step, short)
 
 
 def recent_loss(history: Sequence[float], steps: int) -> float:
@@ -147,36 +145,6 @@ def recent_loss(history: Sequence[float], steps: int) -> float:
     recent = np.asarray(history[-steps:])
     kept = recent[np.isfinite(recent)]
     return float(kept.mean()) if len(kept) else float("nan")
-
-
-def training_limits(config: Training, clouds: Sequence[Cloud]) -> Limits:
-    """Capacities that hold random shares of a batch, with slack."""
-    share = config.batch_size // batch_mesh(config.batch_size).size
-    rng = np.random.default_rng(config.seed)
-    probes = min(len(clouds), PROBES)
-    rows = rng.integers(0, len(clouds), (probes, share))
-    rows[:, 0] = rng.permutation(len(clouds))[:probes]
-
-    def probe(limits: Limits, i: int) -> dict[str, Any]:
-        batch = stack_clouds([channel_of(clouds[int(j)], 0) for j in rows[i]])
-        return jax.device_get(probe_step(config, limits, batch, key=jax.random.key(i)))
-
-    generous = uniform_limits(config.network, 16 * share * config.points)
-    return measure_limits(generous, probe, probes, SLACK)
-
-
-def batch_limits(config: Training, batch: ShadedPoints, step: int) -> Limits:
-    """Capacities that hold the batch of a step, with slack."""
-    devices = batch_mesh(config.batch_size).size
-    size = config.batch_size // devices
-
-    def probe(limits: Limits, i: int) -> dict[str, Any]:
-        share = jax.tree.map(lambda a: a[i * size : (i + 1) * size], batch)
-        key = share_key(config, step, i)
-        return jax.device_get(probe_step(config, limits, share, key=key))
-
-    ample = uniform_limits(config.network, 16 * size * config.points)
-    return measure_limits(ample, probe, devices, SLACK)
 
 
 def save_losses(folder: Path, history: Sequence[float]) -> None:

@@ -124,23 +124,29 @@ def round_up(count: int) -> int:
 def measure_limits(
     limits: Limits, probe: Callable[[Limits, int], Demands], count: int, slack: float
 ) -> Limits:
-    """Host: limits that hold the demands of `count` probes, with slack.
+    """Host: limits that hold the demands of `count` probes, with slack."""
+    return limits_for(suffices_for(1.0, measure_demands(limits, probe, count)), slack)
+
+
+def measure_demands(
+    limits: Limits, probe: Callable[[Limits, int], Demands], count: int
+) -> list[dict[str, int]]:
+    """Host: the demands of `count` probes.
 
     `probe(limits, i)` builds the geometry of example i. `limits` should be generous:
     the first example is probed with them, the others, unless they are `FEW`, with twice
     what the first needed.
     """
-    largest: dict[str, int] = {}
+    found: list[dict[str, int]] = []
     for i in range(count):
         demands = probe(limits, i)
         while short := exceeded(limits, demands):
             limits = raise_limits(limits, short, 2.0)
             demands = probe(limits, i)
-        for name, demand in demands.items():
-            largest[name] = max(largest.get(name, 0), int(np.max(demand)))
+        found.append({name: int(np.max(demand)) for name, demand in demands.items()})
         if i == 0 and count > FEW:
-            limits = limits_for(largest, 2.0)
-    return limits_for(largest, slack)
+            limits = limits_for(found[0], 2.0)
+    return found
 
 
 def limits_for(demands: dict[str, int], slack: float) -> Limits:
@@ -148,3 +154,11 @@ def limits_for(demands: dict[str, int], slack: float) -> Limits:
     return Limits(
         tuple((name, round_up(int(d * slack))) for name, d in demands.items())
     )
+
+
+def suffices_for(share: float, demands: Sequence[dict[str, int]]) -> dict[str, int]:
+    """What, by each name, holds this share of the demands: all of them at 1."""
+    return {
+        name: int(np.quantile([d[name] for d in demands], share, method="higher"))
+        for name in demands[0]
+    }

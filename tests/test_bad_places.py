@@ -59,7 +59,7 @@ def save_cloud(folder):
 
 
 def save_record(folder):
-    checkpoint.save_run(folder, tiny.CONFIG, tiny.LIMITS, {})
+    checkpoint.save_run(folder, tiny.CONFIG, tiny.ROOM, {})
 
 
 def save_losses(folder):

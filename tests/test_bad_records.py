@@ -43,7 +43,7 @@ def run(record=None, text=None, damage=None):
     """The folder of a run with this record and a checkpoint."""
 
     def make(folder):
-        checkpoint.save_run(folder, tiny.CONFIG, tiny.LIMITS, {})
+        checkpoint.save_run(folder, tiny.CONFIG, tiny.ROOM, {})
         saved = json.loads((folder / "run.json").read_text()) | (record or {})
         content = json.dumps(saved) if text is None else text
         (folder / "run.json").write_text(content)

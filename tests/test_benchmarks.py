@@ -77,8 +77,7 @@ def test_neighbors_stops_at_a_search_that_is_wrong(tmp_path, monkeypatch):
 def test_train_step(tmp_path, monkeypatch):
     stand_in(monkeypatch)
     monkeypatch.setitem(presets.PRESETS, "default", tiny.ONE_LEVEL)
-    limits = tiny.ONE_LEVEL_LIMITS
-    monkeypatch.setattr("ginn_jax.fit.training_limits", lambda *_: limits)
+    monkeypatch.setattr(train_step, "training_room", lambda *_: tiny.ONE_LEVEL_ROOM)
     options = train_step.Options(
         tmp_path, shapes=1, batch=1, points=600, queries=64, repeats=1
     )

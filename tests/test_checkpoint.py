@@ -9,9 +9,12 @@ import tiny
 
 from ginn_jax import checkpoint
 from ginn_jax.errors import InputError
+from ginn_jax.limits import Limits
+from ginn_jax.room import Room
 
 CONFIG = replace(tiny.CONFIG, network=tiny.ONE_LEVEL)
 LIMITS = tiny.ONE_LEVEL_LIMITS
+ROOM = Room(Limits(tuple((name, size // 2) for name, size in LIMITS.sizes)), LIMITS)
 EXTRA = {"clouds": 12, "rays": 64}
 SECONDS = {"compile": 31.5, "train": 280.0}
 
@@ -119,13 +122,14 @@ def test_checkpoint_of_another_network_is_refused(third, tmp_path):
 @pytest.fixture
 def recorded(tmp_path):
     """A folder with the record of a run."""
-    checkpoint.save_run(tmp_path, CONFIG, LIMITS, EXTRA, SECONDS)
+    checkpoint.save_run(tmp_path, CONFIG, ROOM, EXTRA, SECONDS)
     return tmp_path
 
 
 def test_record_comes_back(recorded):
-    limits, seconds = checkpoint.load_run(recorded, CONFIG, EXTRA)
-    assert dict(limits.sizes) == dict(LIMITS.sizes)
+    room, seconds = checkpoint.load_run(recorded, CONFIG, EXTRA)
+    assert dict(room.usual.sizes) == dict(ROOM.usual.sizes)
+    assert dict(room.most.sizes) == dict(LIMITS.sizes)
     assert seconds == SECONDS
     assert [p.name for p in recorded.iterdir()] == ["run.json"]
 
@@ -190,7 +194,7 @@ def test_undecodable_record_is_refused(recorded):
 def test_weights_of_a_run_come_back(third, saved, tmp_path):
     """With nothing but the folder: the configuration is read as well."""
     shutil.copytree(saved, tmp_path, dirs_exist_ok=True)
-    checkpoint.save_run(tmp_path, CONFIG, LIMITS, EXTRA)
+    checkpoint.save_run(tmp_path, CONFIG, ROOM, EXTRA)
     config, limits, variables = checkpoint.load_weights(tmp_path)
     assert config == CONFIG
     assert hash(config) == hash(CONFIG)

@@ -90,7 +90,7 @@ def finished_run(folder, network=tiny.ONE_LEVEL):
     """A folder as a training run leaves it, of the tiny untrained network."""
     folder.mkdir()
     config = replace(tiny.CONFIG, network=network)
-    checkpoint.save_run(folder, config, tiny.ONE_LEVEL_LIMITS, LEARNED)
+    checkpoint.save_run(folder, config, tiny.ONE_LEVEL_ROOM, LEARNED)
     manager = checkpoint.open_manager(folder, fresh=True)
     checkpoint.save_state(manager, tiny.fresh_state(config, tiny.ONE_LEVEL_LIMITS))
     manager.close()

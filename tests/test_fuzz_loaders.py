@@ -39,7 +39,7 @@ def written(name):
         elif name.startswith("lit"):
             lit_clouds.save_lit_cloud(path, lit_cloud(), {"seed": 1})
         elif name == "run.json":
-            checkpoint.save_run(path.parent, tiny.CONFIG, tiny.LIMITS, {"seed": 1})
+            checkpoint.save_run(path.parent, tiny.CONFIG, tiny.ROOM, {"seed": 1})
         elif kind in ("hdr", "exr", "pfm"):
             pixels = np.random.default_rng(0).uniform(size=(4, 8, 3))
             use_mitsuba()[0].Bitmap(pixels.astype(np.float32)).write(str(path))

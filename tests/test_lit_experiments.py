@@ -14,6 +14,7 @@ from experiments import gi_train, sss_train
 from ginn_jax import evaluate_light, inference, lit_experiment, presets, scenes
 from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import LitCloud
+from ginn_jax.room import Room
 from ginn_jax.searches import uniform_limits
 from ginn_jax.shading import Encoded
 
@@ -43,7 +44,7 @@ def test_a_small_run_leaves_all_that_is_promised(effect, tmp_path, monkeypatch):
     monkeypatch.setattr(scenes, "ProcessPoolExecutor", tiny.Here)
     # That they are measured is tested where occlusion is.
     limits = uniform_limits(network, 1 << 15)
-    monkeypatch.setattr("ginn_jax.fit.training_limits", lambda *_: limits)
+    monkeypatch.setattr("ginn_jax.fit.training_room", lambda *_: Room(limits, limits))
     options = script.Options(out=tmp_path, **SMALL)
     with tiny.cheap_compiling(), jax.numpy_dtype_promotion("standard"):
         script.main(options)

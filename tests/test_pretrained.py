@@ -29,7 +29,7 @@ def exported(tmp_path_factory):
     """A folder with the untrained tiny network under the name "ao"."""
     run, folder = (tmp_path_factory.mktemp(n) for n in ("run", "weights"))
     state = tiny.fresh_state()
-    checkpoint.save_run(run, tiny.CONFIG, tiny.LIMITS, {"objects": [], "data": {}})
+    checkpoint.save_run(run, tiny.CONFIG, tiny.ROOM, {"objects": [], "data": {}})
     manager = checkpoint.open_manager(run, fresh=True)
     checkpoint.save_state(manager, state)
     manager.close()

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import tiny
 
-from ginn_jax import checkpoint, dataset, fit
+from ginn_jax import checkpoint, dataset, fit, room
 from ginn_jax.errors import InputError
 from ginn_jax.train import state_shapes
 
@@ -80,7 +80,7 @@ def bad_steps(clouds):
 
 def test_training_goes_on(tmp_path, monkeypatch):
     """One cloud is probed for capacities, so that others exceed them on the way."""
-    monkeypatch.setattr(fit, "PROBES", 1)
+    monkeypatch.setattr(room, "PROBES", 1)
     clouds, notes = stressful(), []
     found = train(tmp_path, clouds, progress=lambda s, x, note: notes.append(note))
     bad = bad_steps(clouds)

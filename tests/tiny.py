@@ -16,6 +16,7 @@ from ginn_jax import train
 from ginn_jax.dataset import ShadedPoints, stack_clouds
 from ginn_jax.limits import Limits
 from ginn_jax.presets import compact_network
+from ginn_jax.room import Room
 from ginn_jax.searches import limit_names, uniform_limits
 
 NETWORK = compact_network(k=4, levels=(0.08, 0.2), query_radius=0.16, latent=4)
@@ -39,10 +40,12 @@ def _capacity(name):
 
 # What `measure_limits` finds for `CONFIG`, rounded up.
 LIMITS = Limits(tuple((name, _capacity(name)) for name in limit_names(NETWORK)))
+ROOM = Room(LIMITS, LIMITS)
 
 # One convolution of f_3D: for tests of what is around the network.
 ONE_LEVEL = compact_network(k=2, levels=(0.08,), query_radius=0.16, latent=2)
 ONE_LEVEL_LIMITS = uniform_limits(ONE_LEVEL, 1 << 15)
+ONE_LEVEL_ROOM = Room(ONE_LEVEL_LIMITS, ONE_LEVEL_LIMITS)
 
 
 def sphere_on_plane(count, seed):
