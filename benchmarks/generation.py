@@ -17,7 +17,8 @@ import numpy as np
 from benchmarks.timing import circumstances, describe, measure
 from ginn_jax import lit_scenes, objects, report
 from ginn_jax.commandline import require, start
-from ginn_jax.irradiance import PATHS_PER_LAUNCH, LitScene, indirect_irradiance
+from ginn_jax.estimates import PATHS_PER_LAUNCH
+from ginn_jax.irradiance import LitScene, indirect_irradiance
 from ginn_jax.reference import OFFSET, build_scene, columns
 from ginn_jax.renderer import use_mitsuba
 

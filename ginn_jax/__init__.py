@@ -20,6 +20,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     reference         ambient occlusion and G-buffers by ray tracing
     radiance_files    what the renderer does not check of a map's file
     lighting          environment maps, procedural skies and studios, point lights
+    estimates         rays dealt out to lanes, their mean and variance
     irradiance        direct and indirect irradiance by path tracing
     slab              albedo of a thick slab of a medium, and its inverse
     subsurface        radiant exitance by random walks in a medium
@@ -45,6 +46,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     example           what a training step computes before any parameter enters
     objective         what training minimises
     train             one jitted step: geometry, gradient, update
+    room              capacities of the steps of a run: the usual, and the most
     checkpoint        saving, resuming, loading weights
     fit               the training loop of a run
     shading           f_3D of a cloud and f_2D of queries, in every colour channel

@@ -15,9 +15,9 @@ from jaxtyping import Float
 from ginn_jax import evaluate, evaluate_light
 from ginn_jax.camera import Camera
 from ginn_jax.dataset import count_asked
+from ginn_jax.estimates import ColorEstimate
 from ginn_jax.evaluate import Row, View
 from ginn_jax.evaluate_light import LitView
-from ginn_jax.irradiance import ColorEstimate
 from ginn_jax.lighting import find_environments
 from ginn_jax.lit_scenes import Illumination, Lit, Scattering, light_up
 from ginn_jax.mesh import Mesh, find_meshes

@@ -12,9 +12,9 @@ from ginn_jax import evaluate, evaluate_light
 from ginn_jax.compare import Picture, Shot, Truth, Values, errors, with_truth
 from ginn_jax.dataset import load_arrays, save_arrays
 from ginn_jax.errors import InputError
+from ginn_jax.estimates import ColorEstimate
 from ginn_jax.evaluate import Row, View, timed
 from ginn_jax.evaluate_light import LitView
-from ginn_jax.irradiance import ColorEstimate
 from ginn_jax.reference import Estimate
 from ginn_jax.scenes import Occlusion, Settings
 

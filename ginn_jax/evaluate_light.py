@@ -14,6 +14,7 @@ from jaxtyping import Float
 from ginn_jax.architecture import Network
 from ginn_jax.camera import Camera, orbit_camera
 from ginn_jax.dataset import count_asked
+from ginn_jax.estimates import ColorEstimate
 from ginn_jax.evaluate import (
     Image,
     Model,
@@ -25,7 +26,6 @@ from ginn_jax.evaluate import (
 )
 from ginn_jax.image import Encoded, shade_image
 from ginn_jax.inference import encode_cloud, shade_points
-from ginn_jax.irradiance import ColorEstimate
 from ginn_jax.limits import Limits
 from ginn_jax.lit_clouds import LitCloud, network_numbers, split_points
 from ginn_jax.lit_scenes import (

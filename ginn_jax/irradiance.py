@@ -4,20 +4,26 @@ Points and pixels go through the same functions. All surfaces are diffuse; mater
 an RGB albedo for each material index of the mesh (0 object, 1 ground).
 """
 
-from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from ginn_jax.checks import LARGEST_SEED, real_array, unit_rows, whole
+from ginn_jax.checks import real_array, unit_rows
 from ginn_jax.errors import InputError
+from ginn_jax.estimates import (
+    PATHS_PER_LAUNCH,
+    ColorEstimate,
+    check_draws,
+    joined,
+    lanes,
+    summarize,
+)
 from ginn_jax.lighting import EnvironmentMap, Light, check_light
 from ginn_jax.mesh import Mesh, check_mesh
-from ginn_jax.reference import OFFSET, columns, launches, random_pair
+from ginn_jax.reference import launches, random_pair
 from ginn_jax.renderer import use_mitsuba
 
-PATHS_PER_LAUNCH = 2**22
 # Fractional parts of multiples of these fill the square evenly (Roberts 2018, R2).
 LATTICE = (0.7548776662466927, 0.5698402909980532)
 # After EARLIEST bounces the integrator ends paths, each with a chance of 1 - KEEPING or
@@ -36,13 +42,6 @@ class LitScene(NamedTuple):
     light: Light
     handle: Any
     bounces: int = EARLIEST
-
-
-class ColorEstimate(NamedTuple):
-    """A Monte Carlo mean and the unbiased variance of that mean, for each point."""
-
-    mean: Float[np.ndarray, "N 3"]
-    variance: Float[np.ndarray, "N 3"]
 
 
 def light_scene(mesh: Mesh, albedo: Float[np.ndarray, "K 3"], light: Light) -> LitScene:
@@ -142,7 +141,7 @@ def _direct(
     import drjit as dr
 
     with mi.variant_context(variant):
-        point, ray, at, normal = lanes(scene, points, normals, samples)
+        point, ray, at, normal = lanes(scene.mesh, points, normals, samples)
         number = point + dr.opaque(mi.UInt32, first)
         shift = random_pair(number, mi.UInt32(0), dr.opaque(mi.UInt32, seed))
         # In words, whose multiples wrap around and stay exact however many they are.
@@ -182,19 +181,6 @@ def indirect_irradiance(
     )
 
 
-def joined(parts: Iterable[ColorEstimate]) -> ColorEstimate:
-    """The estimates of all parts of some points, in their order."""
-    nothing = np.zeros((0, 3), np.float32)
-    numbers = zip((nothing, nothing), *parts, strict=True)
-    return ColorEstimate(*(np.concatenate(number) for number in numbers))
-
-
-def check_draws(name: str, count: int, seed: int) -> None:
-    """Raise `InputError` unless so many random draws a point can be made."""
-    whole(name, count, 1, PATHS_PER_LAUNCH)
-    whole("seed", seed, 0, LARGEST_SEED)
-
-
 def _indirect(
     scene: LitScene,
     points: Float[np.ndarray, "n 3"],
@@ -207,7 +193,7 @@ def _indirect(
     import drjit as dr
 
     with mi.variant_context(variant):
-        _, _, at, normal = lanes(scene, points, normals, paths)
+        _, _, at, normal = lanes(scene.mesh, points, normals, paths)
         sampler = mi.load_dict({"type": "independent"})
         number = np.random.SeedSequence((seed, first)).generate_state(1)[0]
         sampler.seed(dr.opaque(mi.UInt32, int(number)), len(points) * paths)
@@ -217,40 +203,3 @@ def _indirect(
         integrator = mi.load_dict(kind)
         radiance, _, _ = integrator.sample(scene.handle, sampler, cast)
         return summarize(np.pi * radiance, paths)
-
-
-def summarize(values: Any, paths: int) -> ColorEstimate:
-    """Mean of every `paths` successive values, and the variance of that mean."""
-    import drjit as dr
-
-    # Or each of the sums below would trace all paths anew.
-    dr.eval(values)
-
-    def mean(value: Any) -> np.ndarray:
-        total = dr.block_reduce(dr.ReduceOp.Add, value, paths)
-        return total.numpy().astype(np.float64) / paths
-
-    middle = np.stack([mean(c) for c in values], axis=1)
-    square = np.stack([mean(c * c) for c in values], axis=1)
-    spread = np.maximum(square - middle**2, 0.0)
-    variance = spread / (paths - 1) if paths > 1 else np.full_like(spread, np.nan)
-    return ColorEstimate(middle.astype(np.float32), variance.astype(np.float32))
-
-
-def lanes(
-    scene: LitScene,
-    points: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    rays: int,
-) -> tuple[Any, Any, Any, Any]:
-    """Point and ray number of every lane, where it starts, and the normal there."""
-    mi, _ = use_mitsuba()
-    import drjit as dr
-
-    offset = OFFSET * float(np.abs(scene.mesh.vertices).max())
-    start = np.asarray(points, np.float32) + np.float32(offset) * normals
-    lane = dr.arange(mi.UInt32, len(points) * rays)
-    point = lane // dr.opaque(mi.UInt32, rays)
-    ray = lane - point * dr.opaque(mi.UInt32, rays)
-    at = dr.gather(mi.Point3f, mi.Point3f(columns(start)), point)
-    return point, ray, at, dr.gather(mi.Normal3f, mi.Normal3f(columns(normals)), point)

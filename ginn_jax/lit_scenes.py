@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float, Int
 
 from ginn_jax.checks import positive, whole
 from ginn_jax.errors import InputError, InputWarning
+from ginn_jax.estimates import ColorEstimate
 from ginn_jax.irradiance import (
-    ColorEstimate,
     LitScene,
     direct_irradiance,
     indirect_irradiance,

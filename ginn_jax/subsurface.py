@@ -11,10 +11,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ginn_jax import irradiance
 from ginn_jax.checks import number, real_array, unit_rows
 from ginn_jax.errors import InputError
-from ginn_jax.irradiance import ColorEstimate, LitScene
+from ginn_jax.estimates import (
+    PATHS_PER_LAUNCH,
+    ColorEstimate,
+    check_draws,
+    joined,
+    lanes,
+    summarize,
+)
+from ginn_jax.irradiance import LATTICE, LitScene
 from ginn_jax.lighting import EnvironmentMap
 from ginn_jax.reference import OFFSET, launches
 from ginn_jax.renderer import use_mitsuba
@@ -67,10 +74,10 @@ def subsurface_exitance(
         raise InputError("the scene has no face of material 0 to enclose a medium")
     parts = [
         _exitance(scene, medium, *launch, paths, seed)
-        for launch in launches(points, normals, paths, irradiance.PATHS_PER_LAUNCH)
+        for launch in launches(points, normals, paths, PATHS_PER_LAUNCH)
     ]
     lost = sum(count for _, count in parts) / max(len(points) * paths, 1)
-    return irradiance.joined(part for part, _ in parts), lost
+    return joined(part for part, _ in parts), lost
 
 
 def _check_medium(medium: Medium, paths: int, seed: int) -> None:
@@ -80,7 +87,7 @@ def _check_medium(medium: Medium, paths: int, seed: int) -> None:
         raise InputError(f"albedo {albedo} must be three numbers in [0, 1]")
     number("extinction", medium.extinction, 0.0)
     number("index of refraction", medium.ior, 1.0, 2.0)
-    irradiance.check_draws("paths", paths, seed)
+    check_draws("paths", paths, seed)
 
 
 def _exitance(
@@ -101,7 +108,7 @@ def _exitance(
     import drjit as dr
 
     with mi.variant_context(variant):
-        _, _, at, inward = irradiance.lanes(scene, points, -normals, paths)
+        _, _, at, inward = lanes(scene.mesh, points, -normals, paths)
         sampler = mi.load_dict({"type": "independent"})
         number = np.random.SeedSequence((seed, first)).generate_state(1)[0]
         sampler.seed(dr.opaque(mi.UInt32, int(number)), len(points) * paths)
@@ -117,7 +124,7 @@ def _exitance(
         arrived = _irradiance(scene, at, normal, sampler, lit)
         arrived = dr.select(lit, weight * arrived, 0)
         dr.eval(arrived, lost)  # together, or each channel would walk anew
-        return irradiance.summarize(arrived, paths), int(lost.numpy().sum())
+        return summarize(arrived, paths), int(lost.numpy().sum())
 
 
 def _walk(
@@ -194,6 +201,6 @@ def _irradiance(
         )
         cosine = dr.fmax(dr.dot(toward.d, normal), 0)
         total += dr.select(toward.pdf > 0, radiance * cosine, 0)
-        square += mi.Point2f(irradiance.LATTICE)
+        square += mi.Point2f(LATTICE)
         square -= dr.floor(square)
     return total / samples

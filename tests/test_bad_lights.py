@@ -8,12 +8,20 @@ from functools import cache
 import numpy as np
 from refusals import BOX, INF, NAN, PLACES, POINTS, UP, Table, assert_refused, each_row
 
-from ginn_jax import irradiance, lighting, lit_scenes, objects, slab, subsurface
+from ginn_jax import (
+    estimates,
+    irradiance,
+    lighting,
+    lit_scenes,
+    objects,
+    slab,
+    subsurface,
+)
 
 SKY = lighting.constant_sky()
 LAMP = lighting.PointLight(np.ones(3), np.ones(3))
 GREY = np.full((2, 3), 0.5)
-MOST = irradiance.PATHS_PER_LAUNCH
+MOST = estimates.PATHS_PER_LAUNCH
 MEDIUM = subsurface.Medium(np.full(3, 0.5), 1.0, 1.3)
 
 

@@ -6,7 +6,7 @@ import trimesh
 from media import BALL, IORS, SLAB, medium_of, scene_of, surface
 from rooms import total
 
-from ginn_jax import irradiance
+from ginn_jax import subsurface
 from ginn_jax.irradiance import direct_irradiance
 from ginn_jax.lighting import EnvironmentMap, PointLight, constant_sky, studio
 from ginn_jax.slab import external_reflectance
@@ -196,7 +196,7 @@ def test_seed_decides_and_chunks_are_joined(monkeypatch):
     one, _ = exitance(0)
     np.testing.assert_array_equal(one.mean, exitance(0)[0].mean)
     assert not np.array_equal(one.mean, exitance(1)[0].mean)
-    monkeypatch.setattr(irradiance, "PATHS_PER_LAUNCH", 32 * 7)
+    monkeypatch.setattr(subsurface, "PATHS_PER_LAUNCH", 32 * 7)
     parts, _ = exitance(0)
     assert parts.mean.shape == parts.variance.shape == (40, 3)
     assert len(np.unique(parts.mean[:, 0])) > 30

@@ -5,7 +5,7 @@ import pytest
 from media import BALL, SLAB, medium_of, scene_of, surface
 from rooms import total
 
-from ginn_jax import irradiance
+from ginn_jax import estimates
 from ginn_jax.lighting import constant_sky
 from ginn_jax.renderer import use_mitsuba
 from ginn_jax.slab import single_scattering_albedo
@@ -53,7 +53,7 @@ def volpath_exitance(shape, medium, points, normals, paths):
         )
         values = np.pi * leaves * radiance
         dr.eval(values)
-        return irradiance.summarize(values, paths)
+        return estimates.summarize(values, paths)
 
 
 @pytest.mark.parametrize("shape", [BALL, SLAB], ids=["ball", "slab"])
