@@ -6,7 +6,7 @@ nearly all, the few others in limits that hold everything met so far.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -75,10 +75,12 @@ def training_room(config: Training, clouds: Sequence[Cloud]) -> Room:
 def with_more(
     room: Room, config: Training, batch: ShadedPoints, step: int, short: dict[str, int]
 ) -> Room:
-    """Room for the batch of a step as well, of which `short` did not suffice."""
-    return replace(
-        room, most=widened(room.most, batch_limits(config, batch, step), short)
-    )
+    """Room for the batch of a step as well, of which `short` did not suffice.
+
+    One size of room stays one.
+    """
+    more = widened(room.most, batch_limits(config, batch, step), short)
+    return Room(more if room.usual == room.most else room.usual, more)
 
 
 def batch_limits(config: Training, batch: ShadedPoints, step: int) -> Limits:
