@@ -176,14 +176,8 @@ def main(options: Options) -> dict[str, Any]:
     require(options, {"shapes": 1, "batch": 1, "points": 500, "queries": 1})
     require(options, {"repeats": 1})
     begin = time.perf_counter()
-    network = presets.PRESETS[options.preset]
-    config = Training(
-        network,
-        steps=1000,
-        batch_size=options.batch,
-        points=options.points,
-        queries=options.queries,
-    )
+    sizes = options.batch, options.points, options.queries
+    config = Training(presets.PRESETS[options.preset], 1000, *sizes)
     batch, limits = make_batch(options, config)
     share = config.batch_size // batch_mesh(config.batch_size).size
     small = jax.tree.map(lambda a: a[:share], batch)

@@ -12,7 +12,6 @@ from typing import Any, Literal
 
 import jax
 import numpy as np
-from matplotlib.figure import Figure
 from PIL import Image
 from rich.console import Console
 
@@ -190,7 +189,7 @@ def measure(options: Options, frames: dict[str, np.ndarray]) -> dict[str, Any]:
         change = sequences.flicker(images, reference, variance, mask)
         error = float(error[mask].mean()) / unit
         rows.append({"method": name, "flicker": change / unit, "mse_2d": error})
-    draw_strip(options.out, {n: frames[n] * albedo for n in (*methods, "reference")})
+    draw_frames(options.out, {n: frames[n] * albedo for n in (*methods, "reference")})
     return {
         "flicker": rows,
         "options": {k: str(v) for k, v in asdict(options).items()},
@@ -198,7 +197,7 @@ def measure(options: Options, frames: dict[str, np.ndarray]) -> dict[str, Any]:
     }
 
 
-def draw_strip(out: Path, frames: dict[str, np.ndarray]) -> None:
+def draw_frames(out: Path, frames: dict[str, np.ndarray]) -> None:
     """strip.png, a row a method; animation.gif, all methods side by side."""
     out.mkdir(parents=True, exist_ok=True)
     reference = frames["reference"]
@@ -210,16 +209,7 @@ def draw_strip(out: Path, frames: dict[str, np.ndarray]) -> None:
         return tone_map(flat, whole, seen).reshape(images.shape)
 
     mapped = {name: shown(images) for name, images in frames.items()}
-    picks = np.linspace(0, len(reference) - 1, min(len(reference), 6)).astype(int)
-    size = (1.8 * len(picks), 1.9 * len(mapped))
-    figure = Figure(figsize=size, layout="constrained")
-    grid = np.atleast_2d(figure.subplots(len(mapped), len(picks), squeeze=False))
-    for line, (name, images) in zip(grid, mapped.items(), strict=True):
-        for axes, pick in zip(line, picks, strict=True):
-            axes.imshow(images[pick], cmap="gray", vmin=0, vmax=1)
-            axes.axis("off")
-        line[0].set_title(name, fontsize=8, loc="left")
-    figure.savefig(out / "strip.png", dpi=110)
+    report.draw_strip(out / "strip.png", mapped)
     side_by_side = np.concatenate(list(mapped.values()), axis=2)
     moving = [Image.fromarray((255 * f).astype(np.uint8)) for f in side_by_side]
     moving[0].save(

@@ -25,6 +25,7 @@ from ginn_jax.train import Training, TrainState, state_shapes
 
 KEPT = 2
 CHECKPOINTS, RECORD = "checkpoints", "run.json"
+OLD = "{} is of another version of ginn_jax: train again"
 UNSPENT = {"compile": 0.0, "train": 0.0}
 
 
@@ -149,6 +150,8 @@ def load_run(
     """
     path = folder / RECORD
     record = read_record(path, "no run to resume: leave out --resume")
+    if isinstance(record, dict) and "limits" in record and "usual" not in record:
+        raise InputError(OLD.format(path))
     with damaged(path, "delete it and start anew"):
         training = dict(record["training"])
         room = Room(limits_from(record, "usual"), limits_from(record))
@@ -173,7 +176,7 @@ def load_run(
 def check_names(path: Path, network: Network, limits: Limits) -> None:
     """Raise `InputError` unless these are the capacities that the network needs."""
     if {name for name, _ in limits.sizes} != set(limit_names(network)):
-        raise InputError(f"{path} is of another version of ginn_jax: train again")
+        raise InputError(OLD.format(path))
 
 
 def load_weights(folder: Path) -> tuple[Training, Limits, Variables]:

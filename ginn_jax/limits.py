@@ -22,8 +22,9 @@ Demands = dict[str, Int[Any, ""]]
 Made = TypeVar("Made")
 # What is made room for beyond what was needed.
 SLACK = 1.25
-# So many probes take less time than compiling them for tighter limits does.
-FEW = 8
+# So many probes take less time than compiling them for tighter limits does; what they
+# needed at the most, times so much, is seldom exceeded by others.
+FEW, AMPLE = 8, 3.0
 
 
 @dataclass(frozen=True)
@@ -134,8 +135,8 @@ def measure_demands(
     """Host: the demands of `count` probes.
 
     `probe(limits, i)` builds the geometry of example i. `limits` should be generous:
-    the first example is probed with them, the others, unless they are `FEW`, with twice
-    what the first needed.
+    the first `FEW` examples are probed with them, any others with `AMPLE` times what
+    those needed at the most. Every limit that is raised costs a compilation.
     """
     found: list[dict[str, int]] = []
     for i in range(count):
@@ -144,8 +145,8 @@ def measure_demands(
             limits = raise_limits(limits, short, 2.0)
             demands = probe(limits, i)
         found.append({name: int(np.max(demand)) for name, demand in demands.items()})
-        if i == 0 and count > FEW:
-            limits = limits_for(found[0], 2.0)
+        if len(found) == FEW < count:
+            limits = limits_for(suffices_for(1.0, found), AMPLE)
     return found
 
 

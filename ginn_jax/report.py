@@ -145,6 +145,23 @@ def draw_color_views(
     figure.savefig(path, dpi=90)
 
 
+def draw_strip(
+    path: Path, rows: Mapping[str, Float[np.ndarray, "T H W *C"]], most: int = 6
+) -> None:
+    """A row of frames for every title, at most so many of them, evenly spread."""
+    frames = len(next(iter(rows.values())))
+    picks = np.linspace(0, frames - 1, min(frames, most)).astype(int)
+    size = (1.8 * len(picks), 1.9 * len(rows))
+    figure = Figure(figsize=size, layout="constrained")
+    grid = np.atleast_2d(figure.subplots(len(rows), len(picks), squeeze=False))
+    for line, (title, images) in zip(grid, rows.items(), strict=True):
+        for axes, pick in zip(line, picks, strict=True):
+            axes.imshow(images[pick], cmap="gray", vmin=0, vmax=1)
+            axes.axis("off")
+        line[0].set_title(title, fontsize=8, loc="left")
+    figure.savefig(path, dpi=110)
+
+
 def draw_error_against_time(
     path: Path, groups: Mapping[str, Sequence[Mapping[str, Any]]]
 ) -> None:

@@ -229,3 +229,12 @@ def test_weights_of_another_version_are_refused(recorded):
     path.write_text(path.read_text().replace('"level_0.words"', '"level_0.buckets"'))
     with pytest.raises(InputError, match=r"another version"):
         checkpoint.load_weights(recorded)
+
+
+def test_a_run_of_before_two_sizes_of_room_is_of_another_version(recorded):
+    path = recorded / "run.json"
+    record = json.loads(path.read_text())
+    del record["usual"]
+    path.write_text(json.dumps(record))
+    with pytest.raises(InputError, match=r"^[^\n]*another version[^\n]*$"):
+        checkpoint.load_run(recorded, CONFIG, EXTRA)

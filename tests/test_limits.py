@@ -43,7 +43,7 @@ def test_limits_that_are_too_small_are_named(shallow, names):
 
 @pytest.mark.parametrize("start", [100, 1 << 19])
 @pytest.mark.parametrize(
-    "sizes", [(700, 1000), (1000, 700), (5, 4000), (700,) * 10 + (1000,)]
+    "sizes", [(700, 1000), (1000, 700), (5, 4000), (700,) * 10 + (2000,)]
 )
 def test_measured_limits_fit(start, sizes):
     """From limits that are too small, and from generous ones."""
