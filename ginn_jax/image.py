@@ -15,7 +15,7 @@ from ginn_jax.architecture import Network
 from ginn_jax.checks import LARGEST, number
 from ginn_jax.errors import InputError
 from ginn_jax.inference import shade_points
-from ginn_jax.limits import Limits
+from ginn_jax.limits import Limits, largest
 from ginn_jax.network import Variables
 from ginn_jax.shading import Encoded, numbers_asked
 from ginn_jax.upsample import Surface, sample_pixels, upsample
@@ -97,7 +97,7 @@ def shade_image(
     places = tuple(sample_pixels(n, resolution_scale) for n in mask.shape)
     sampled = np.zeros_like(mask)
     sampled[np.ix_(*places)] = mask[np.ix_(*places)]
-    limits = compute(sampled, limits)
+    limits = largest(limits, compute(sampled, limits))
     surface, thickness = Surface(position, normal, mask), 0.2 * network.query.radius
     given = values[np.ix_(*places)], *places, surface, thickness
     between, known = map(np.asarray, _upsample(*given))

@@ -1,7 +1,8 @@
 """f_3D of a cloud once, f_2D at any points: on the host, sizing themselves.
 
 Both hold no more than a block of queries at a time, and where a capacity is too small
-they measure what is needed and try again; the limits that sufficed come back for reuse.
+they measure what is needed and try again. Limits come back that fit what was made: pass
+them on for the same again, where the scene or the camera moves a little.
 """
 
 from collections.abc import Sequence
@@ -20,6 +21,7 @@ from ginn_jax.limits import (
     SLACK,
     Demands,
     Limits,
+    largest,
     measure_limits,
     say_raised,
     with_room,
@@ -67,7 +69,7 @@ def encode_cloud(
     *,
     key: Key[Array, ""],
 ) -> tuple[Encoded, Limits]:
-    """Codes of a cloud, and the limits that sufficed.
+    """Codes of a cloud, and the limits that fit it.
 
     Raises:
         InputError: an empty cloud, or one that is not finite; normals that are not of
@@ -197,7 +199,7 @@ def shade_points(
     light: Float[np.ndarray, "C M L"] | None = None,
     coherent: bool = False,
 ) -> tuple[Float[np.ndarray, "M *C"], Limits]:
-    """Values at any points, in blocks over all devices; the limits that sufficed.
+    """Values at any points, in blocks over all devices; the limits that fit those.
 
     With light they have a last axis of channels. `material` and `light` of the points
     themselves are needed only where the network asks for all. Points that come
@@ -235,6 +237,8 @@ def shade_points(
     finest = encoded.points, encoded.grid, encoded.area
     measure = partial(query_limits, network, finest, blocks, coherent)
     parts, sufficed = with_room(limits, attempt, measure)
+    if len(blocks) == 1:  # it may be a small one, of which larger ones need more
+        sufficed = largest(sufficed, limits)
     say_raised(limits, sufficed)
     channels = () if encoded.scale is None else encoded.scale.shape
     values = [np.zeros((0, *channels), np.float32)]

@@ -22,6 +22,8 @@ Demands = dict[str, Int[Any, ""]]
 Made = TypeVar("Made")
 # What is made room for beyond what was needed.
 SLACK = 1.25
+# Calls in room for more than so many times that take a third longer and more.
+LOOSE = 2.0
 # So many probes take less time than compiling them for tighter limits does; what they
 # needed at the most, times so much, is seldom exceeded by others.
 FEW, AMPLE = 8, 3.0
@@ -65,7 +67,7 @@ def with_room(
     attempt: Callable[[Limits], tuple[Made, Sequence[Demands]]],
     measure: Callable[[], Limits] | None = None,
 ) -> tuple[Made, Limits]:
-    """Host: what `attempt` makes in limits that suffice for its demands, and those.
+    """Host: what `attempt` makes in limits that suffice, and limits for the same again.
 
     Where several searches build on each other, what the later ones say they need means
     little once an earlier one lacked room: a Poisson disk that misses edges keeps too
@@ -74,18 +76,46 @@ def with_room(
     while True:
         made, demands = attempt(limits)
         if not (short := most_exceeded(limits, jax.device_get(demands))):
-            return made, limits
+            return made, fitted(limits, jax.device_get(demands))
         measured = limits if measure is None else measure()
         limits = widened(limits, measured, short)
 
 
+def in_fitting_room(
+    limits: Limits,
+    attempt: Callable[[Limits], tuple[Made, Sequence[Demands]]],
+    measure: Callable[[], Limits],
+) -> tuple[Made, Limits]:
+    """Host: `with_room`, made anew where room was loose: for what is used often."""
+    made, fit = with_room(limits, attempt, measure)
+    return (made, fit) if fit == limits else with_room(fit, attempt, measure)
+
+
+def fitted(limits: Limits, demands: Sequence[Demands]) -> Limits:
+    """Host: limits that fit these demands with slack, unless the given ones about do.
+
+    Half as much again and more is worth a compilation to whoever makes the same again;
+    so little more is not that what differs a little would not run in them as well.
+    """
+    need = most_exceeded(Limits(tuple((n, -1) for n, _ in limits.sizes)), demands)
+    snug = dict(limits_for(need, SLACK).sizes)
+    if all(limits.of(name) <= LOOSE * size for name, size in snug.items()):
+        return limits
+    return Limits(tuple((n, min(size, snug.get(n, size))) for n, size in limits.sizes))
+
+
+def largest(limits: Limits, *others: Limits) -> Limits:
+    """Host: limits as large as all, for what may be as large as any."""
+    sizes = [dict(other.sizes) for other in others]
+    return Limits(
+        tuple((n, max(size, *(s.get(n, 0) for s in sizes))) for n, size in limits.sizes)
+    )
+
+
 def widened(limits: Limits, measured: Limits, short: dict[str, int]) -> Limits:
     """Limits as large as both; where that is nothing new, raised by what was short."""
-    sizes = dict(measured.sizes)
-    wider = tuple((n, max(size, sizes.get(n, 0))) for n, size in limits.sizes)
-    if wider == limits.sizes:
-        return raise_limits(limits, short, SLACK)
-    return Limits(wider)
+    wider = largest(limits, measured)
+    return raise_limits(limits, short, SLACK) if wider == limits else wider
 
 
 def say_raised(given: Limits, found: Limits) -> None:

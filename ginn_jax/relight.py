@@ -25,7 +25,7 @@ from ginn_jax.inference import (
     query_limits,
     without,
 )
-from ginn_jax.limits import Demands, Limits, say_raised, with_room
+from ginn_jax.limits import Demands, Limits, in_fitting_room, say_raised
 from ginn_jax.lit_clouds import LitCloud, network_numbers
 from ginn_jax.mcconv import stored_kernel
 from ginn_jax.neighbors import bucket
@@ -160,7 +160,7 @@ def prepare_relighting(
         return plan, [demands]
 
     measure = partial(cloud_limits, network, points, key=key)
-    scene, sufficed = with_room(limits, plan_points, measure)
+    scene, sufficed = in_fitting_room(limits, plan_points, measure)
 
     def plan_blocks(limits: Limits) -> tuple[list[QueryPlan], list[Demands]]:
         flat = only(limits, network.query.name)
@@ -175,7 +175,7 @@ def prepare_relighting(
 
     finest = scene.geometry.levels[0], scene.geometry.grid, scene.geometry.area
     measure = partial(query_limits, network, finest, blocks)
-    plans, sufficed = with_room(sufficed, plan_blocks, measure)
+    plans, sufficed = in_fitting_room(sufficed, plan_blocks, measure)
     say_raised(limits, sufficed)
     return Relightable(scene, tuple(plans)), sufficed
 

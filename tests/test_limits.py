@@ -92,3 +92,58 @@ def test_presets_name_each_limit_once():
         names = se.limit_names(config)
         assert len(set(names)) == len(names)
         assert se.uniform_limits(config, 5).of(names[-1]) == 5
+
+
+NEEDS = st.dictionaries(
+    st.sampled_from(["a", "b", "c"]), st.integers(0, 10**6), min_size=1
+)
+
+
+@given(NEEDS, st.integers(0, 10**7), st.integers(0, 10**7))
+def test_fitted_limits_hold_what_was_needed_and_stay(needs, spare, other):
+    ample = lm.Limits((*((n, need + spare) for n, need in needs.items()), ("q", other)))
+    found = lm.fitted(ample, [as_jax(needs)])
+    assert lm.exceeded(found, as_jax(needs)) == {}
+    assert all(size <= ample.of(name) for name, size in found.sizes)
+    assert found.of("q") == other
+    assert lm.fitted(found, [as_jax(needs)]) == found
+
+
+@given(NEEDS, st.floats(1.0, 20.0))
+def test_limits_are_fitted_only_where_they_are_loose(needs, slack):
+    ample = lm.limits_for(needs, slack)
+    found = lm.fitted(ample, [as_jax(needs)])
+    if slack <= lm.LOOSE * lm.SLACK:
+        assert found == ample
+    if slack > 2 * lm.LOOSE * lm.SLACK and max(needs.values()) > 100:
+        assert sum(dict(found.sizes).values()) < sum(dict(ample.sizes).values())
+
+
+@given(NEEDS, NEEDS)
+def test_the_largest_limits_hold_what_any_does(one, other):
+    names = {"a": 0, "b": 0, "c": 0}
+    limits = [lm.Limits(tuple((names | sizes).items())) for sizes in (one, other)]
+    both = lm.largest(*limits)
+    for needs in (one, other):
+        assert lm.exceeded(both, as_jax(needs)) == {}
+    assert all(size in (limits[0].of(n), limits[1].of(n)) for n, size in both.sizes)
+
+
+def test_the_same_again_is_made_at_once():
+    """Room that is loose is fitted for the next call, and for use often at once."""
+    tried = []
+
+    def attempt(limits):
+        tried.append(limits)
+        return limits.of("a"), [as_jax({"a": 1000})]
+
+    loose = lm.Limits((("a", 10_000),))
+    made, fit = lm.with_room(loose, attempt)
+    assert made == 10_000
+    assert 1000 <= fit.of("a") < 1500
+    assert lm.with_room(fit, attempt) == (fit.of("a"), fit)
+    assert len(tried) == 2
+    assert lm.in_fitting_room(loose, attempt, lambda: loose) == (fit.of("a"), fit)
+    assert tried[2:] == [loose, fit]
+    assert lm.in_fitting_room(fit, attempt, lambda: fit) == (fit.of("a"), fit)
+    assert tried[4:] == [fit]
