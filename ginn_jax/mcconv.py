@@ -46,25 +46,47 @@ def mc_conv_mixing(
     return _convolve(_mixing, receivers, outputs, kernel, features, field)
 
 
-def stored_kernel(kernel: Kernel, field: Field) -> Float[Array, "K E"]:
+def stored_kernel(kernel: Kernel, field: Field) -> Float[Array, "E K"]:
     """Weighted kernel values of every edge, for `apply_stored`."""
     outputs = kernel.w1.shape[0] * kernel.w3.shape[2]
     values = evaluate_kernel(kernel, field.inputs, outputs)
-    return values * field.weight
+    return (values * field.weight).T
 
 
 def apply_stored(
-    stored: Float[Array, "K E"],
+    stored: Float[Array, "E K"],
     features: Float[Array, "N C"],
     field: Field,
     receivers: int,
 ) -> Float[Array, "M C"]:
-    """`mc_conv` with kernel values at hand."""
-    given = field._replace(inputs=stored[: features.shape[1]])
-    return _convolve(_stored, receivers, features.shape[1], None, features, given)
+    """`mc_conv` with kernel values at hand, in the order that they are taken in.
+
+    Has no gradient.
+    """
+    bare = field._replace(inputs=field.inputs[:0])
+
+    def add(tile: _Tile, total: Float[Array, "M C"]) -> Float[Array, "M C"]:
+        size = tile.sender.shape[0]
+        values = jax.lax.dynamic_slice_in_dim(stored, tile.start, size)
+        values = values[:, : features.shape[1]] * features[tile.sender]
+        return total.at[tile.receiver].add(values, mode="drop")
+
+    shape = receivers, features.shape[1]
+    return _over_tiles(bare, add, jnp.zeros(shape, features.dtype))
 
 
-def _stored(
+def weighted_sum(
+    weights: Float[Array, "C E"],
+    features: Float[Array, "N C"],
+    field: Field,
+    receivers: int,
+) -> Float[Array, "M C"]:
+    """Sum over the edges of every receiver, each feature weighted in its own way."""
+    given = field._replace(inputs=weights)
+    return _convolve(_weighted, receivers, features.shape[1], None, features, given)
+
+
+def _weighted(
     evaluate: Any,
     kernel: None,
     outputs: int,

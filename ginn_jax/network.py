@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from ginn_jax.architecture import Conv, Network
 from ginn_jax.geometry import Geometry
 from ginn_jax.kernels import init_kernel
-from ginn_jax.mcconv import apply_stored, mc_conv, mc_conv_mixing
+from ginn_jax.mcconv import apply_stored, mc_conv, mc_conv_mixing, weighted_sum
 from ginn_jax.receptive_field import Field
 
 SLOPE = 0.2
@@ -171,7 +171,7 @@ def splat(values: Float[Array, "N"], field: Field, receivers: int) -> Float[Arra
         near *= jnp.maximum(field.inputs[5], 0.0) ** 4 + LEAST_LIKENESS
     both = jnp.stack([values, jnp.ones_like(values)], axis=1)
     share = jnp.broadcast_to(near * field.weight, (2, near.size))
-    total, weight = apply_stored(share, both, field, receivers).T
+    total, weight = weighted_sum(share, both, field, receivers).T
     return jnp.where(weight > 0, total / jnp.where(weight > 0, weight, 1.0), 0.0)
 
 
