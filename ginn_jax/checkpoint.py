@@ -190,6 +190,8 @@ def load_weights(folder: Path) -> tuple[Training, Limits, Variables]:
     with damaged(path, "train again"):
         config = training_from(record["training"])
         limits = limits_from(record)
+        if "usual" in record:  # others are given more when they come
+            limits = limits_from(record, "usual")
     check_names(path, config.network, limits)
     if not (folder / CHECKPOINTS).is_dir():
         raise InputError(f"{folder} holds no checkpoint yet: let its run go on")

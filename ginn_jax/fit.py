@@ -112,7 +112,7 @@ def fit(
             save_run(folder, config, room, extra, seconds)
             save_state(manager, state)
     finish(manager)
-    return Fit(state, room.most, np.array(history, np.float32), seconds, raised)
+    return Fit(state, room.usual, np.array(history, np.float32), seconds, raised)
 
 
 def latest(

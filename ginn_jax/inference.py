@@ -1,8 +1,7 @@
 """f_3D of a cloud once, f_2D at any points: on the host, sizing themselves.
 
 Both hold no more than a block of queries at a time, and where a capacity is too small
-they measure what is needed and try again. Limits come back that fit what was made: pass
-them on for the same again, where the scene or the camera moves a little.
+they measure what is needed and try again; the limits that sufficed come back for reuse.
 """
 
 from collections.abc import Sequence
@@ -21,7 +20,7 @@ from ginn_jax.limits import (
     SLACK,
     Demands,
     Limits,
-    largest,
+    fitted,
     measure_limits,
     say_raised,
     with_room,
@@ -69,7 +68,7 @@ def encode_cloud(
     *,
     key: Key[Array, ""],
 ) -> tuple[Encoded, Limits]:
-    """Codes of a cloud, and the limits that fit it.
+    """Codes of a cloud, and the limits that sufficed.
 
     Raises:
         InputError: an empty cloud, or one that is not finite; normals that are not of
@@ -91,7 +90,7 @@ def encode_cloud(
         return made, [demands]
 
     measure = partial(cloud_limits, network, cloud, key=key)
-    encoded, sufficed = with_room(limits, attempt, measure)
+    encoded, sufficed, _ = with_room(limits, attempt, measure)
     say_raised(limits, sufficed)
     return encoded._replace(center=center), sufficed
 
@@ -199,7 +198,7 @@ def shade_points(
     light: Float[np.ndarray, "C M L"] | None = None,
     coherent: bool = False,
 ) -> tuple[Float[np.ndarray, "M *C"], Limits]:
-    """Values at any points, in blocks over all devices; the limits that fit those.
+    """Values at any points, in blocks over all devices; limits for the same again.
 
     With light they have a last axis of channels. `material` and `light` of the points
     themselves are needed only where the network asks for all. Points that come
@@ -236,9 +235,9 @@ def shade_points(
 
     finest = encoded.points, encoded.grid, encoded.area
     measure = partial(query_limits, network, finest, blocks, coherent)
-    parts, sufficed = with_room(limits, attempt, measure)
-    if len(blocks) == 1:  # it may be a small one, of which larger ones need more
-        sufficed = largest(sufficed, limits)
+    parts, sufficed, demands = with_room(limits, attempt, measure)
+    if len(blocks) > 1:  # a single one may be small
+        sufficed = fitted(sufficed, demands)
     say_raised(limits, sufficed)
     channels = () if encoded.scale is None else encoded.scale.shape
     values = [np.zeros((0, *channels), np.float32)]

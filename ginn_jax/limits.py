@@ -66,8 +66,8 @@ def with_room(
     limits: Limits,
     attempt: Callable[[Limits], tuple[Made, Sequence[Demands]]],
     measure: Callable[[], Limits] | None = None,
-) -> tuple[Made, Limits]:
-    """Host: what `attempt` makes in limits that suffice, and limits for the same again.
+) -> tuple[Made, Limits, Sequence[Demands]]:
+    """Host: what `attempt` makes in limits that suffice for its demands, and both.
 
     Where several searches build on each other, what the later ones say they need means
     little once an earlier one lacked room: a Poisson disk that misses edges keeps too
@@ -75,8 +75,9 @@ def with_room(
     """
     while True:
         made, demands = attempt(limits)
-        if not (short := most_exceeded(limits, jax.device_get(demands))):
-            return made, fitted(limits, jax.device_get(demands))
+        demands = jax.device_get(demands)
+        if not (short := most_exceeded(limits, demands)):
+            return made, limits, demands
         measured = limits if measure is None else measure()
         limits = widened(limits, measured, short)
 
@@ -87,15 +88,17 @@ def in_fitting_room(
     measure: Callable[[], Limits],
 ) -> tuple[Made, Limits]:
     """Host: `with_room`, made anew where room was loose: for what is used often."""
-    made, fit = with_room(limits, attempt, measure)
-    return (made, fit) if fit == limits else with_room(fit, attempt, measure)
+    made, sufficed, demands = with_room(limits, attempt, measure)
+    if (fit := fitted(sufficed, demands)) != sufficed:
+        made, sufficed, _ = with_room(fit, attempt, measure)
+    return made, sufficed
 
 
 def fitted(limits: Limits, demands: Sequence[Demands]) -> Limits:
     """Host: limits that fit these demands with slack, unless the given ones about do.
 
-    Half as much again and more is worth a compilation to whoever makes the same again;
-    so little more is not that what differs a little would not run in them as well.
+    Every other size is compiled for anew: worth it to whoever makes the same again, not
+    where each scene is another.
     """
     need = most_exceeded(Limits(tuple((n, -1) for n, _ in limits.sizes)), demands)
     snug = dict(limits_for(need, SLACK).sizes)

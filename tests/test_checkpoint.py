@@ -198,7 +198,7 @@ def test_weights_of_a_run_come_back(third, saved, tmp_path):
     config, limits, variables = checkpoint.load_weights(tmp_path)
     assert config == CONFIG
     assert hash(config) == hash(CONFIG)
-    assert dict(limits.sizes) == dict(LIMITS.sizes)
+    assert dict(limits.sizes) == dict(ROOM.usual.sizes)
     assert tiny.identical(jax.tree.map(np.array, variables), third.variables)
     assert all(len(a.devices()) == 1 for a in jax.tree.leaves(variables))
 
