@@ -28,6 +28,8 @@ class Options(LitOptions):
     """Homogeneous in light, exactly linear, the authors' table, or an ablation."""
     paths: int = 16
     """Paths per training point."""
+    steps: int = 1500
+    """Training steps."""
     size: float = 100.0
     """Longest side of the objects in mm."""
     absorption: float = 0.1
