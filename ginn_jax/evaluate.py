@@ -13,7 +13,7 @@ from ginn_jax.camera import Camera, orbit_camera
 from ginn_jax.dataset import ShadedPoints, count_given
 from ginn_jax.image import Encoded, as_openness, shade_image
 from ginn_jax.inference import encode_cloud, shade_points
-from ginn_jax.limits import Limits, largest
+from ginn_jax.limits import Limits
 from ginn_jax.mesh import Mesh
 from ginn_jax.metrics import (
     dssim,
@@ -73,7 +73,7 @@ def evaluate_clouds(
     rows = []
     for name, cloud in zip(names, clouds, strict=True):
         given, asked = split_cloud(cloud)
-        encoded, used = encode_cloud(
+        encoded, limits = encode_cloud(
             network,
             limits,
             model.variables,
@@ -81,10 +81,9 @@ def evaluate_clouds(
             given.normal,
             key=model.key,
         )
-        values, more = shade_points(
+        values, limits = shade_points(
             network, limits, model.variables, encoded, asked.position, asked.normal
         )
-        limits = largest(limits, used, more)
         noise = float(np.mean(asked.variance))
         raw = mse(as_openness(values), asked.target)
         spread = float(np.var(asked.target)) - noise

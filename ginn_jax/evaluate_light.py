@@ -26,7 +26,7 @@ from ginn_jax.evaluate import (
 )
 from ginn_jax.image import Encoded, shade_image
 from ginn_jax.inference import encode_cloud, shade_points
-from ginn_jax.limits import Limits, largest
+from ginn_jax.limits import Limits
 from ginn_jax.lit_clouds import LitCloud, network_numbers, split_points
 from ginn_jax.lit_scenes import (
     Illumination,
@@ -88,11 +88,10 @@ def evaluate_lit_clouds(
     targets = settings.targets or count_asked(settings.points)
     for name, cloud in zip(names, clouds, strict=True):
         given, asked = split_points(cloud, len(cloud.position) - targets)
-        encoded, used = encode_lit(network, limits, model, given)
+        encoded, limits = encode_lit(network, limits, model, given)
         numbers = network_numbers(asked, channels_of(encoded))
         ends = model.variables, encoded, asked.position, asked.normal
-        values, more = shade_points(network, limits, *ends, *numbers)
-        limits = largest(limits, used, more)
+        values, limits = shade_points(network, limits, *ends, *numbers)
         errors = unit_errors(encoded, asked, np.maximum(values, 0.0))
         rows.append({"name": name, "points": int(np.sum(encoded.points.mask))} | errors)
         rows[-1]["ray_variance"] = rows[-1]["noise_floor_3d"] * settings.paths
