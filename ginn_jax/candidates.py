@@ -1,8 +1,11 @@
-"""Which points queries may be near: packets of 32 queries share one list of candidates.
+"""Which points queries may be near: packets of queries share one list of candidates.
 
 Those are the points in the grid columns and layers within the radius of the packet's
 bounding box. Queries may come in any order: a packet that is spread out costs time,
 never an edge. `voxels.morton_order` keeps packets small.
+
+A packet is of 32 queries, of 128 where they lie much closer together than the radius
+reaches, as an image's pixels do: fewer lists, hardly longer ones.
 """
 
 from collections.abc import Callable
@@ -20,7 +23,7 @@ from ginn_jax.voxels import (
     saturating_sum,
 )
 
-PACKET = 32
+PACKET, DENSE_PACKET = 32, 128
 WORD = 32
 
 
@@ -46,12 +49,13 @@ def packet_columns(
     query: Float[Array, "M 3"],
     mask: Bool[Array, "M"],
     radius: Float[Array, ""],
+    packet: int = PACKET,
 ) -> tuple[Columns, Int[Array, ""]]:
     """The columns that each packet has to look into, and how many in all."""
     far = jnp.float32(jnp.finfo(jnp.float32).max)
     reach = 1.00001 * radius
-    low = _of_packets(jnp.minimum, jnp.where(mask[:, None], query, far))
-    high = _of_packets(jnp.maximum, jnp.where(mask[:, None], query, -far))
+    low = _of_packets(jnp.minimum, jnp.where(mask[:, None], query, far), packet)
+    high = _of_packets(jnp.maximum, jnp.where(mask[:, None], query, -far), packet)
     empty = low[:, :1] > high[:, :1]
     low = jnp.where(empty, 0.0, low) - reach
     high = jnp.where(empty, 0.0, high) + reach
@@ -68,10 +72,10 @@ def packet_columns(
 
 
 def _of_packets(
-    extreme: Callable[[Array, Array], Array], query: Float[Array, "M 3"]
+    extreme: Callable[[Array, Array], Array], query: Float[Array, "M 3"], packet: int
 ) -> Float[Array, "P 3"]:
     """The extreme of each packet by halving: XLA's own reduction is scalar on CPU."""
-    lanes = query.T.reshape(3, -1, PACKET)
+    lanes = query.T.reshape(3, -1, packet)
     while lanes.shape[2] > 1:
         lanes = extreme(*jnp.split(lanes, 2, axis=2))
     return lanes[:, :, 0].T

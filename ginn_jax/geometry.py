@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int, Key
 
 from ginn_jax.architecture import Conv, Network
+from ginn_jax.candidates import DENSE_PACKET, PACKET
 from ginn_jax.hierarchy import Level, LevelLimit, build_level, draw_lots, same_side
 from ginn_jax.limits import Demands, Limits
 from ginn_jax.packets import Demand, EdgeLimit, Edges, radius_edges
@@ -44,14 +45,17 @@ class Geometry(NamedTuple):
 
 
 def search(
-    conv: Conv, limits: Limits, grid: VoxelGrid, receivers: Oriented
+    conv: Conv,
+    limits: Limits,
+    grid: VoxelGrid,
+    receivers: Oriented,
+    packet: int = PACKET,
 ) -> tuple[Edges, Demands]:
     """Edges of one convolution and their demands; `grid` holds the senders."""
     names = [f"{conv.name}.{part}" for part in Demand._fields]
     limit = EdgeLimit(*(limits.of(name) for name in names))
-    edges = radius_edges(
-        grid, receivers.position, receivers.mask, jnp.float32(conv.radius), limit
-    )
+    ends = grid, receivers.position, receivers.mask, jnp.float32(conv.radius)
+    edges = radius_edges(*ends, limit, packet=packet)
     return edges, dict(zip(names, edges.demand, strict=True))
 
 
@@ -216,9 +220,14 @@ def build_query_field(
     grid: VoxelGrid,
     area: Array | None,
     queries: Oriented,
+    dense: bool = False,
 ) -> tuple[Field, Demands]:
-    """The field of f_2D: from the finest level, its grid and areas, to the queries."""
-    edges, demands = search(network.query, limits, grid, queries)
+    """The field of f_2D: from the finest level, its grid and areas, to the queries.
+
+    `dense` queries, pixels in coherent order, are searched for in larger packets.
+    """
+    packet = DENSE_PACKET if dense else PACKET
+    edges, demands = search(network.query, limits, grid, queries, packet)
     field, more = receptive_field(
         network, network.query, limits, finest, queries, edges, area
     )

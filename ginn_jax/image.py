@@ -7,7 +7,6 @@ from functools import lru_cache
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -19,10 +18,11 @@ from ginn_jax.limits import Limits, largest
 from ginn_jax.network import Variables
 from ginn_jax.shading import Encoded, numbers_asked
 from ginn_jax.upsample import Surface, sample_pixels, upsample
-from ginn_jax.voxels import morton_code
+
+# Cells of space that pixels are sorted into, in radii of f_2D.
+COARSE = 4.0
 
 _upsample = jax.jit(upsample)
-_coarse_cells = jax.jit(lambda *points: morton_code(*points, bits=5).astype(jnp.uint16))
 
 
 @lru_cache(maxsize=8)
@@ -36,18 +36,21 @@ def pixel_order(height: int, width: int) -> Int[np.ndarray, "P"]:
 
 
 def coherent_pixels(
-    position: Float[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"]
+    position: Float[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"], cell: float
 ) -> Int[np.ndarray, "M"]:
     """The pixels in `mask`, neighbours in the image and in space together.
 
-    Along a curve of the image within coarse cells of space, which keeps apart what only
-    the image has side by side. Sorting 16 bits takes NumPy a pass or two.
+    Along a curve of the image within cells of space that wide, which keeps apart what
+    only the image has side by side; of 32 cells each way, for then they begin anew.
+    Sorting 16 bits takes NumPy a pass or two.
     """
     order = pixel_order(*mask.shape)
     rows = order[mask.reshape(-1)[order]]
-    flat = np.asarray(position, np.float32).reshape(-1, 3), mask.reshape(-1)
-    cell = np.asarray(_coarse_cells(*flat))[rows]
-    return rows[np.argsort(cell, kind="stable")]
+    place = np.asarray(position, np.float32).reshape(-1, 3).take(rows, axis=0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        x, y, z = ((place / np.float32(cell)).astype(np.int32) & 31).T
+    code = (x << 10 | y << 5 | z).astype(np.uint16)
+    return rows[np.argsort(code, kind="stable")]
 
 
 def shade_image(
@@ -77,7 +80,7 @@ def shade_image(
     channels = () if encoded.scale is None else encoded.scale.shape
     values = np.full((*mask.shape, *channels), background, np.float32)
     material, light = numbers_asked(network, material, light)
-    pixel = coherent_pixels(position, mask)
+    pixel = coherent_pixels(position, mask, COARSE * network.query.radius)
 
     def compute(wanted: Bool[np.ndarray, "H W"], limits: Limits) -> Limits:
         rows = pixel[wanted.reshape(-1)[pixel]]

@@ -44,13 +44,9 @@ BLOCK = 1 << 15
 
 
 encode_whole = jax.jit(encode, static_argnums=(0, 1))
-
-
 shade_block = jax.jit(
     shade, static_argnums=(0, 1), static_argnames="coherent", compiler_options=ALONE
 )
-
-
 _cloud_demands = jax.jit(cloud_demands, static_argnums=(0, 1))
 _query_demands = jax.jit(
     query_demands, static_argnums=(0, 1), static_argnames="coherent"
@@ -187,6 +183,31 @@ def in_blocks(
     return [Oriented(*(a[i : i + size] for a in points)) for i in starts]
 
 
+def _shade_blocks(
+    network: Network,
+    variables: Variables,
+    encoded: Encoded,
+    blocks: Sequence[Oriented],
+    numbers: tuple[Float[np.ndarray, "C R _"] | None, ...],
+    coherent: bool,
+    limits: Limits,
+) -> tuple[list[Array], list[Demands]]:
+    """Values of every block, which take turns on all devices, and their demands."""
+    needed = {"shader": variables["shader"]}, encoded._replace(center=None)
+    copies = [jax.device_put(needed, device) for device in jax.devices()]
+    flat = only(limits, network.query.name)
+    parts, demands = [], []
+    for turn, queries in enumerate(blocks):
+        size = len(queries.mask)
+        rows = slice(turn * size, (turn + 1) * size)
+        own = (None if a is None else a[:, rows] for a in numbers)
+        ends = *copies[turn % len(copies)], queries
+        values, demand = shade_block(network, flat, *ends, *own, coherent=coherent)
+        parts.append(values)
+        demands.append(demand)
+    return parts, demands
+
+
 def shade_points(
     network: Network,
     limits: Limits,
@@ -211,28 +232,12 @@ def shade_points(
     if network.asks == "all":
         check_numbers("material", material, network.materials, len(position))
         check_numbers("light", light, network.lights, len(position))
-    center, encoded = encoded.center, encoded._replace(center=None)
-    needed = {"shader": variables["shader"]}, encoded
-    copies = [jax.device_put(needed, device) for device in jax.devices()]
     size = block_size(len(position), encoded.scale is not None)
-    blocks = in_blocks(center, position, normal, size)
+    blocks = in_blocks(encoded.center, position, normal, size)
     asked = numbers_asked(network, material, light)
     numbers = tuple(pad_channels(a, len(blocks) * size) for a in asked)
-
-    def attempt(limits: Limits) -> tuple[list[Array], list[Demands]]:
-        parts, demands = [], []
-        flat = only(limits, network.query.name)
-        for turn, queries in enumerate(blocks):
-            rows = slice(turn * size, (turn + 1) * size)
-            own = (None if a is None else a[:, rows] for a in numbers)
-            arrays = copies[turn % len(copies)]
-            values, demand = shade_block(
-                network, flat, *arrays, queries, *own, coherent=coherent
-            )
-            parts.append(values)
-            demands.append(demand)
-        return parts, demands
-
+    ends = network, variables, encoded, blocks, numbers, coherent
+    attempt = partial(_shade_blocks, *ends)
     finest = encoded.points, encoded.grid, encoded.area
     measure = partial(query_limits, network, finest, blocks, coherent)
     parts, sufficed, demands = with_room(limits, attempt, measure)

@@ -1,6 +1,6 @@
 """Radius search by packets of queries: jit-compatible, fixed capacity, nothing dropped.
 
-Packets of 32 consecutive queries share one list of `candidates`. What is left for the
+Packets of consecutive queries share one list of `candidates`. What is left for the
 single query is a dense test against 32 of them at a time, whose outcome is one word of
 bits; edges are listed by counting and selecting bits. So the cost is that of the edges,
 not of the candidates.
@@ -24,7 +24,8 @@ from ginn_jax.candidates import (
 )
 from ginn_jax.voxels import Expansion, VoxelGrid, expand_ranges, prefix_sum
 
-TILE = 512
+# Words that are computed at a time.
+TILE = 1 << 14
 PairFilter = Callable[[Int[Array, "..."], Int[Array, "..."]], Bool[Array, "..."]]
 
 
@@ -64,12 +65,12 @@ class Edges(NamedTuple):
 class Words(NamedTuple):
     """Bit b of `word[l, q]`: query `query[l, q]` is near the list's candidate b.
 
-    One list is 32 candidates of one packet. `order` are the rows of the flat words by
-    query, and under a query by list; padding comes last.
+    One list is 32 candidates of one packet of Q queries. `order` are the rows of the
+    flat words by query, and under a query by list; padding comes last.
     """
 
-    word: UInt32[Array, "L 32"]
-    query: Int[Array, "L 32"]
+    word: UInt32[Array, "L Q"]
+    query: Int[Array, "L Q"]
     first: Int[Array, "L"]
     order: Int[Array, "W"]
 
@@ -81,21 +82,25 @@ def radius_edges(
     radius: Float[Array, ""],
     limit: EdgeLimit,
     pair_filter: PairFilter | None = None,
+    packet: int = PACKET,
 ) -> Edges:
     """Every (point, query) pair closer than `radius`, sorted by query.
 
     `pair_filter(sender, receiver)` may drop pairs; it sees broadcast index arrays.
+    `packet` is how many queries share a list, a power of two.
     Where `demand` exceeds `limit`, edges are missing.
     """
     count = query.shape[0]
-    padding = -count % PACKET
+    padding = -count % packet
     query = jnp.pad(query, ((0, padding), (0, 0)))
     mask = jnp.pad(mask, (0, padding))
-    under, columns = packet_columns(grid, query, mask, radius)
+    under, columns = packet_columns(grid, query, mask, radius, packet)
     near, candidates = packet_candidates(grid, under, limit.columns, limit.candidates)
     words = packet_words(grid, query, mask, radius, near, limit.words, pair_filter)
-    (row, receiver, real), edges = list_bits(words, near, limit.edges)
-    sender = jnp.where(real, grid.index[row], 0)
+    # Of the candidates, fewer than the edges: what an edge names is looked up once.
+    near = near._replace(row=grid.index[near.row])
+    (sender, receiver, real), edges = list_bits(words, near, limit.edges)
+    sender = jnp.where(real, sender, 0)
     receiver = jnp.where(real, receiver, count)
     demand = Demand(columns, candidates, count_words(near), edges)
     return Edges(sender, receiver, demand)
@@ -117,58 +122,62 @@ def packet_words(
     """
     lists = -(-near.count // WORD)
     chunk, total = expand_ranges(jnp.zeros_like(lists), lists, capacity)
+    packet = query.shape[0] // lists.shape[0]
     first = near.start[chunk.owner] + WORD * chunk.row
     left = jnp.where(chunk.valid, near.count[chunk.owner] - WORD * chunk.row, 0)
     point, bit = grid.position.T, jnp.arange(WORD, dtype=jnp.int32)
-    lane = jnp.where(mask, query.T, jnp.nan).reshape(3, -1, PACKET)
+    lane = jnp.where(mask, query.T, jnp.nan).reshape(3, -1, packet)
 
-    def test(*lists: Int[Array, "T"]) -> UInt32[Array, "T 32"]:
-        packet, first, left = lists
+    def test(*lists: Int[Array, "T"]) -> UInt32[Array, "T Q"]:
+        owner, first, left = lists
         place = first[:, None] + bit
         row = near.row[jnp.minimum(place, near.row.size - 1)]
         real = (bit < left[:, None]) & (place < near.row.size)
         hit = jnp.float32(0)
         for axis in range(3):
             place = jnp.where(real, point[axis][row], jnp.nan)
-            hit += (lane[axis][packet][:, :, None] - place[:, None, :]) ** 2
+            hit += (lane[axis][owner][:, :, None] - place[:, None, :]) ** 2
         hit = hit < radius**2
         if pair_filter is not None:
-            own = packet[:, None] * PACKET + jnp.arange(PACKET, dtype=jnp.int32)
+            own = owner[:, None] * packet + jnp.arange(packet, dtype=jnp.int32)
             hit &= pair_filter(grid.index[row][:, None, :], own[:, :, None])
         # A sum, so that XLA does not compute a word anew for each edge that looks.
         flags = jnp.uint32(1) << bit.astype(jnp.uint32)
         word = jnp.where(hit, flags, jnp.uint32(0))
         return jnp.sum(word, axis=-1, dtype=jnp.uint32)
 
-    word = _in_tiles(test, (chunk.owner, first, left), total)
+    word = _in_tiles(test, (chunk.owner, first, left), total, packet)
     if number is None:
-        order = _order_in_packets(chunk, lists)
+        order = _order_in_packets(chunk, lists, packet)
         number = jnp.arange(query.shape[0], dtype=jnp.int32)
     else:
-        order = _order_by_number(chunk, lists, number)
-    return Words(word, number.reshape(-1, PACKET)[chunk.owner], first, order)
+        order = _order_by_number(chunk, lists, number, packet)
+    return Words(word, number.reshape(-1, packet)[chunk.owner], first, order)
 
 
 def _in_tiles(
-    test: Callable[..., UInt32[Array, "T 32"]],
+    test: Callable[..., UInt32[Array, "T Q"]],
     lists: tuple[Int[Array, "L"], ...],
     count: Int[Array, ""],
-) -> UInt32[Array, "L 32"]:
+    packet: int,
+) -> UInt32[Array, "L Q"]:
     """`test` of the first `count` lists, on CPU in tiles that fit a core's cache."""
     rows = lists[0].shape[0]
-    size = min(TILE, rows) if jax.default_backend() == "cpu" else rows
+    size = min(TILE // packet, rows) if jax.default_backend() == "cpu" else rows
 
-    def fill(tile: Int[Array, ""], word: UInt32[Array, "L 32"]) -> Array:
+    def fill(tile: Int[Array, ""], word: UInt32[Array, "L Q"]) -> Array:
         start = jnp.minimum(tile * size, rows - size)
         some = [jax.lax.dynamic_slice_in_dim(a, start, size) for a in lists]
         return jax.lax.dynamic_update_slice_in_dim(word, test(*some), start, axis=0)
 
-    nothing = jnp.zeros((rows, PACKET), jnp.uint32)
+    nothing = jnp.zeros((rows, packet), jnp.uint32)
     tiles = (jnp.minimum(count, rows) + size - 1) // size
     return jax.lax.fori_loop(0, tiles, fill, nothing)
 
 
-def _order_in_packets(chunk: Expansion, lists: Int[Array, "P"]) -> Int[Array, "W"]:
+def _order_in_packets(
+    chunk: Expansion, lists: Int[Array, "P"], packet: int
+) -> Int[Array, "W"]:
     """Rows of the words with those of a query side by side, so that its edges will be.
 
     The words of a packet lie [list, query] and are wanted [query, list].
@@ -177,25 +186,25 @@ def _order_in_packets(chunk: Expansion, lists: Int[Array, "P"]) -> Int[Array, "W
     begin = prefix_sum(lists) - lists
     width = jnp.clip(capacity - begin, 1, jnp.maximum(lists, 1))
     begin, width = (a[chunk.owner][:, None] for a in (begin, width))
-    place = jnp.arange(capacity * PACKET, dtype=jnp.int32).reshape(-1, PACKET)
-    inside = place - begin * PACKET
+    place = jnp.arange(capacity * packet, dtype=jnp.int32).reshape(-1, packet)
+    inside = place - begin * packet
     # Integer division is slow; what rounding spoils is put right.
     query = (inside.astype(jnp.float32) / width.astype(jnp.float32)).astype(jnp.int32)
     query -= (query * width > inside).astype(jnp.int32)
     query += ((query + 1) * width <= inside).astype(jnp.int32)
-    order = (begin + inside - query * width) * PACKET + query
+    order = (begin + inside - query * width) * packet + query
     return jnp.where(chunk.valid[:, None], order, place).reshape(-1)
 
 
 def _order_by_number(
-    chunk: Expansion, lists: Int[Array, "P"], number: Int[Array, "M"]
+    chunk: Expansion, lists: Int[Array, "P"], number: Int[Array, "M"], packet: int
 ) -> Int[Array, "W"]:
     """The same where queries are numbered otherwise than they lie."""
-    rows = chunk.owner.shape[0] * PACKET
-    query_lists = jnp.repeat(lists, PACKET)
+    rows = chunk.owner.shape[0] * packet
+    query_lists = jnp.repeat(lists, packet)
     begin = jnp.zeros_like(query_lists).at[number].set(query_lists)
     begin = (prefix_sum(begin) - begin)[number]
-    place = begin.reshape(-1, PACKET)[chunk.owner] + chunk.row[:, None]
+    place = begin.reshape(-1, packet)[chunk.owner] + chunk.row[:, None]
     place = jnp.where(chunk.valid[:, None], place, rows).reshape(-1)
     order = jnp.full(rows, rows - 1, jnp.int32)
     return order.at[place].set(jnp.arange(rows, dtype=jnp.int32), mode="drop")
@@ -204,13 +213,13 @@ def _order_by_number(
 def list_bits(
     words: Words, near: Candidates, capacity: int
 ) -> tuple[tuple[Int[Array, "E"], Int[Array, "E"], Bool[Array, "E"]], Int[Array, ""]]:
-    """Row, query and validity of every set bit, and how many there are."""
+    """What `near.row` says, query and validity of each set bit; how many there are."""
     flat = words.word.reshape(-1)
     hits = jax.lax.population_count(flat[words.order]).astype(jnp.int32)
     slots, total = expand_ranges(jnp.zeros_like(hits), hits, capacity)
     place = words.order[slots.owner]
     bit = select_bit(flat[place], slots.row)
-    row = jnp.where(slots.valid, words.first[place // PACKET] + bit, 0)
+    row = jnp.where(slots.valid, words.first[place // words.word.shape[1]] + bit, 0)
     return (near.row[row], words.query.reshape(-1)[place], slots.valid), total
 
 

@@ -106,9 +106,9 @@ def shade(
     order = None
     if not coherent:
         queries, order = in_coherent_order(queries)
-    field, demands = build_query_field(
-        network, limits, encoded.points, encoded.grid, encoded.area, queries
-    )
+    finest = encoded.points, encoded.grid, encoded.area
+    given = network, limits, *finest, queries
+    field, demands = build_query_field(*given, dense=coherent)
     lit = encoded.code, encoded.scale
     numbers = material, light
     values = shade_channels(network, variables, field, queries, order, *lit, *numbers)
@@ -124,7 +124,7 @@ def query_demands(
 ) -> Demands:
     """What `shade` needs of every capacity, without f_2D itself."""
     queries = queries if coherent else in_coherent_order(queries)[0]
-    return build_query_field(network, limits, *finest, queries)[1]
+    return build_query_field(network, limits, *finest, queries, dense=coherent)[1]
 
 
 def shade_channels(

@@ -159,7 +159,7 @@ def test_no_pixel_leaves_the_range(variables, encoded):
 def test_coherent_pixels_are_those_of_the_mask(mask, position):
     """Each once; what lies outside the mask may be anything."""
     position = np.where(mask[:, :, None], position, np.nan)
-    rows = image.coherent_pixels(position, mask)
+    rows = image.coherent_pixels(position, mask, 1.0)
     np.testing.assert_array_equal(np.sort(rows), np.flatnonzero(mask))
 
 
@@ -169,7 +169,7 @@ def test_coherent_pixels_of_two_sheets_keep_them_apart():
     far = np.indices(mask.shape).sum(0) % 2
     plane = np.stack(np.meshgrid(np.arange(64), np.arange(64)), -1) / 64
     position = np.concatenate([plane, 10.0 * far[..., None]], axis=-1)
-    turns = np.diff(far.reshape(-1)[image.coherent_pixels(position, mask)])
+    turns = np.diff(far.reshape(-1)[image.coherent_pixels(position, mask, 1.0)])
     assert np.abs(turns).sum() == 1
 
 

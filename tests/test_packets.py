@@ -9,10 +9,11 @@ from oracles import neighbors
 
 from ginn_jax import packets as pk
 from ginn_jax import voxels as vx
-from ginn_jax.candidates import PACKET
+from ginn_jax.candidates import DENSE_PACKET, PACKET
 
 pick = jax.jit(pk.select_bit)
-search = jax.jit(pk.radius_edges, static_argnames="limit")
+search = jax.jit(pk.radius_edges, static_argnames=("limit", "packet"))
+sizes = pytest.mark.parametrize("packet", [PACKET, DENSE_PACKET])
 make_grid = jax.jit(vx.build_grid)
 ROOM = pk.EdgeLimit(4096, 1 << 15, 1024, 1 << 15)
 
@@ -40,10 +41,10 @@ def crowd():
     )
 
 
-def pairs(points, queries, radius, limit=ROOM):
+def pairs(points, queries, radius, packet, limit=ROOM):
     grid = make_grid(points, np.ones(len(points), bool), np.float32(radius))
     mask = np.ones(len(queries), bool)
-    edges = search(grid, queries, mask, np.float32(radius), limit)
+    edges = search(grid, queries, mask, np.float32(radius), limit, packet=packet)
     edges = jax.tree.map(np.asarray, edges)
     real = edges.receiver < len(queries)
     assert (np.diff(edges.receiver) >= 0).all()
@@ -54,23 +55,25 @@ def pairs(points, queries, radius, limit=ROOM):
     return set(listed), edges.demand
 
 
-def test_lists_of_several_words_and_a_last_packet_that_is_not_full(crowd):
+@sizes
+def test_lists_of_several_words_and_a_last_packet_that_is_not_full(crowd, packet):
     points, queries = crowd
-    assert len(queries) % PACKET
-    found, demand = pairs(points, queries, 0.3)
+    assert len(queries) % packet
+    found, demand = pairs(points, queries, 0.3, packet)
     assert found == set(neighbors(points.astype(float), queries.astype(float), 0.3))
-    assert demand.words > 2 * -(-len(queries) // PACKET)
+    assert demand.words > 2 * -(-len(queries) // packet)
 
 
-def test_exact_limits_suffice_and_one_less_is_told(crowd):
+@sizes
+def test_exact_limits_suffice_and_one_less_is_told(crowd, packet):
     points, queries = crowd
-    full, demand = pairs(points, queries, 0.3)
+    full, demand = pairs(points, queries, 0.3, packet)
     exact = pk.EdgeLimit(*(int(need) for need in demand))
-    assert pairs(points, queries, 0.3, exact) == (full, demand)
+    assert pairs(points, queries, 0.3, packet, exact) == (full, demand)
     for name in demand._fields:
         short = pk.EdgeLimit(
             **{n: int(v) - (n == name) for n, v in demand._asdict().items()}
         )
-        found, told = pairs(points, queries, 0.3, short)
+        found, told = pairs(points, queries, 0.3, packet, short)
         assert found <= full
         assert getattr(told, name) == getattr(demand, name)
