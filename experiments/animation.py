@@ -18,12 +18,18 @@ from rich.console import Console
 from ginn_jax import compare, compare_report, report, sequences
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
-from ginn_jax.compare import Shot, Stage
-from ginn_jax.compare_networks import Trained, load_networks, network_values
+from ginn_jax.compare import Stage
+from ginn_jax.compare_networks import (
+    OURS,
+    Trained,
+    load_networks,
+    mean_values,
+    network_values,
+)
 from ginn_jax.compare_screen import screen_pictures
 from ginn_jax.compare_tracing import trace
 from ginn_jax.dataset import ShadedPoints
-from ginn_jax.evaluate import View, fill
+from ginn_jax.evaluate import fill
 from ginn_jax.experiment import bar
 from ginn_jax.lighting import Light, load_environment, procedural_environment
 from ginn_jax.lit_clouds import mean_light
@@ -58,6 +64,8 @@ class Options:
     """Side of the images in pixels."""
     reference: int = 256
     """Rays or paths per pixel of the reference."""
+    draws: int = 4
+    """Draws of the Poisson disks over which our network's mean is taken beside it."""
     points: int | None = None
     """Samples of the object and its ground; left out, 64,000 for ambient occlusion,
     32,000 for light."""
@@ -72,12 +80,13 @@ class Options:
 
 
 QUICK = {"frames": 2, "resolution": 48, "reference": 8, "points": 3000, "looks": 32}
+QUICK |= {"draws": 2}
 
 
 def main(options: Options) -> dict[str, Any]:
     """Shade all frames; returns what metrics.json holds."""
     least = {"frames": 2, "resolution": 32, "reference": 2, "points": 1000, "looks": 1}
-    require(options, least | {"seed": 0})
+    require(options, least | {"seed": 0, "draws": 2})
     console = Console()
     counts = options.points, options.reference
     settings = compare.effect_settings(options.effect, *counts, options.radius)
@@ -147,9 +156,11 @@ def shade_frame(
         values[picture.row["method"]] = picture.values
     for name, trained in networks.items():
         values[name], networks[name] = network_values(trained, given, shot)
+    name, mean = mean_values(networks[OURS], given, shot, options.draws)
+    values[name] = mean
     mask = shot.gbuffer.mask
     images = {n: fill(mask, np.asarray(v)) for n, v in values.items()}
-    return images | {"mask": mask, "albedo": albedo_of(shot)}, networks
+    return images | {"mask": mask, "albedo": compare.albedo_of(shot)}, networks
 
 
 def stage_of(
@@ -163,17 +174,6 @@ def stage_of(
     lit = light_mesh(mesh, light, settings, seed=options.seed)
     cloud = lit_points(lit, samples, options.looks, seed=options.seed)
     return cloud, lit, mean_light(cloud)
-
-
-def albedo_of(shot: Shot) -> np.ndarray:
-    """What the transported light is multiplied by to be seen."""
-    mask = shot.gbuffer.mask
-    if isinstance(shot, View):
-        return mask.astype(np.float32)
-    albedo = shot.pixels.albedo[shot.pixels.material]
-    if shot.pixels.medium.size:
-        albedo = np.ones_like(albedo)
-    return fill(mask, albedo)
 
 
 def measure(options: Options, frames: dict[str, np.ndarray]) -> dict[str, Any]:

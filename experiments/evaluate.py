@@ -26,6 +26,7 @@ from ginn_jax.compare_networks import (
     codes_kept,
     errors_at_points,
     load_networks,
+    mean_picture,
     network_memory,
     network_picture,
     points_given,
@@ -74,6 +75,8 @@ class Options:
     """Rays or paths per pixel of the traced rivals."""
     disks: tuple[float, ...] = (0.75, 1.5)
     """Poisson disk radii at which our network runs beside its own, as times that."""
+    draws: int = 4
+    """Draws of the Poisson disks over which our network's mean is taken beside it."""
     points: int | None = None
     """Samples per object, of which a fifth measure, the others are given; left out,
     64,000 for ambient occlusion, 32,000 for light."""
@@ -88,13 +91,13 @@ class Options:
 
 
 QUICK = {"objects": 1, "views": 1, "resolution": 64, "reference": 16, "points": 4000}
-QUICK |= {"counts": (1, 4), "disks": ()}
+QUICK |= {"counts": (1, 4), "disks": (), "draws": 2}
 
 
 def main(options: Options) -> dict[str, Any]:
     """Run the comparison; returns what metrics.json holds."""
     least = {"objects": 1, "views": 1, "resolution": 32, "reference": 2, "seed": 0}
-    require(options, least | {"points": 1000, "looks": 1})
+    require(options, least | {"points": 1000, "looks": 1, "draws": 2})
     console = Console()
     targets = 64 if options.quick else TARGET_PATHS
     given = options.effect, options.points, targets, options.radius
@@ -193,6 +196,7 @@ def rivals(
         variant = at_disk_radius(trained, radius)
         name = f"ours, disk {radius:.3g}"
         rows.append(network_picture(name, variant, given, shot)[0].row)
+    rows.append(mean_picture(networks[OURS], given, shot, options.draws, units).row)
     for count in options.counts:
         seed = 1_000_003 + options.seed
         noisy = traced_picture(shot, settings, count, units, seed=seed)

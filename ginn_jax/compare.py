@@ -105,6 +105,17 @@ def target_of(shot: Shot) -> Values:
     return shot.pixels.target
 
 
+def albedo_of(shot: Shot) -> np.ndarray:
+    """What the transported light is multiplied by to be seen."""
+    mask = shot.gbuffer.mask
+    if isinstance(shot, View):
+        return mask.astype(np.float32)
+    albedo = shot.pixels.albedo[shot.pixels.material]
+    if shot.pixels.medium.size:
+        albedo = np.ones_like(albedo)
+    return evaluate.fill(mask, albedo)
+
+
 def displayed(shot: Shot, pictures: list[Picture]) -> dict[str, np.ndarray]:
     """What the methods show, and the reference."""
     values = {p.row["method"]: p.values for p in pictures}

@@ -7,12 +7,19 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Key
+from jaxtyping import Array, Float, Key
 
 from ginn_jax import evaluate, evaluate_light
 from ginn_jax.architecture import Network
 from ginn_jax.checkpoint import RECORD, damaged, read_record
-from ginn_jax.compare import Picture, Shot, Values, of_variance, scratch_mib
+from ginn_jax.compare import (
+    Picture,
+    Shot,
+    Values,
+    errors,
+    of_variance,
+    scratch_mib,
+)
 from ginn_jax.dataset import ShadedPoints, count_given
 from ginn_jax.disk_radius import limits_at, with_disk_radius
 from ginn_jax.errors import InputError
@@ -83,6 +90,13 @@ def at_disk_radius(trained: Trained, radius: float) -> Trained:
     return variant, limits_at(network, limits, radius), model
 
 
+def redrawn(trained: Trained, draws: int) -> list[Trained]:
+    """The same network on so many draws of the Poisson disks, its own first."""
+    network, limits, (variables, key) = trained
+    keys = [key, *(jax.random.fold_in(key, n) for n in range(1, draws))]
+    return [(network, limits, Model(variables, key)) for key in keys]
+
+
 def learned_from(name: str, run: Path | None) -> dict[str, Any]:
     """What made the targets that a network learned from."""
     if run is None:
@@ -148,6 +162,24 @@ def network_picture(
     return Picture(row, values), (network, limits, model)
 
 
+def mean_picture(
+    trained: Trained,
+    cloud: ShadedPoints | LitCloud,
+    shot: Shot,
+    draws: int,
+    units: Float[np.ndarray, "C"] | None,
+) -> Picture:
+    """The mean over several draws of the Poisson disks, which costs the time of all."""
+    pictures = [
+        network_picture(OURS, own, cloud, shot)[0] for own in redrawn(trained, draws)
+    ]
+    values = np.mean([p.values for p in pictures], axis=0)
+    parts = "seconds_3d", "seconds_2d", "seconds"
+    times = {part: sum(p.row[part] for p in pictures) for part in parts}
+    row = {"method": f"{OURS}, mean of {draws}"} | times | errors(shot, values, units)
+    return Picture(row, values)
+
+
 def codes_kept(row: Row) -> Row:
     """A network's row where the codes of f_3D are at hand: only the camera has moved
     since, neither the scene nor its light."""
@@ -177,6 +209,14 @@ def network_values(
             network, limits, model.variables, encoded, *pixels, *numbers
         )
     return within_range(encoded, values), (network, limits, model)
+
+
+def mean_values(
+    trained: Trained, cloud: ShadedPoints | LitCloud, shot: Shot, draws: int
+) -> tuple[str, Values]:
+    """The name and values of the mean over several draws of the disks, not timed."""
+    values = [network_values(own, cloud, shot)[0] for own in redrawn(trained, draws)]
+    return f"{OURS}, mean of {draws}", np.mean(values, axis=0)
 
 
 def network_memory(trained: Trained, points: int) -> float:

@@ -5,6 +5,7 @@ import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 import tiny
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 
 from experiments import evaluate as experiment
 from ginn_jax import checkpoint, compare_networks, inference, scenes
-from ginn_jax.compare_networks import OURS
+from ginn_jax.compare_networks import OURS, redrawn
 from ginn_jax.compare_report import (
     RIVALS,
     inset_place,
@@ -21,6 +22,7 @@ from ginn_jax.compare_report import (
     pareto_front,
     pool_shots,
 )
+from ginn_jax.evaluate import Model
 
 numbers = st.floats(1e-3, 1e3)
 rows = st.lists(st.tuples(numbers, numbers), min_size=1, max_size=12).map(
@@ -105,6 +107,14 @@ def small_blocks(monkeypatch):
         monkeypatch.setattr(module, "BLOCK", 128)
 
 
+def test_draws_are_distinct_and_begin_with_the_networks_own():
+    key = jax.random.key(3)
+    drawn = redrawn((tiny.NETWORK, tiny.LIMITS, Model({}, key)), 3)
+    keys = [tuple(jax.random.key_data(model.key).tolist()) for _, _, model in drawn]
+    assert keys[0] == tuple(jax.random.key_data(key).tolist())
+    assert len(set(keys)) == 3
+
+
 @pytest.mark.usefixtures("small_blocks")
 def test_light_is_compared_with_tracing_plain_and_denoised(tmp_path, monkeypatch):
     """By a denoiser that leaves the image as it is."""
@@ -130,10 +140,12 @@ def test_light_is_compared_with_tracing_plain_and_denoised(tmp_path, monkeypatch
         reference=8,
         counts=(2,),
         disks=(0.75,),
+        draws=2,
         points=1500,
     )
     found = experiment.main(options)
     rows = {row["method"]: row for row in found["error_against_time"]}
+    assert rows["ours, mean of 2"]["seconds"] > rows[OURS]["seconds_3d"]
     assert {"ours, disk 0.06", "ours, scale 0.5", "3D only"} <= set(rows)
     kept = rows["ours, codes kept"]
     assert kept["mse_2d"] == rows[OURS]["mse_2d"]
