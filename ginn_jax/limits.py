@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Int
 
 from ginn_jax.checks import LARGEST_INDEX
 from ginn_jax.errors import InputError
+from ginn_jax.process import spare_memory_maps
 
 LOG = logging.getLogger("ginn_jax")
 Demands = dict[str, Int[Any, ""]]
@@ -71,13 +72,15 @@ def with_room(
 
     Where several searches build on each other, what the later ones say they need means
     little once an earlier one lacked room: a Poisson disk that misses edges keeps too
-    many points. `measure` finds limits by what all of them truly need.
+    many points. `measure` finds limits by what all of them truly need. Every other size
+    is another program, and a process has room for so many, see `process`.
     """
     while True:
         made, demands = attempt(limits)
         demands = jax.device_get(demands)
         if not (short := most_exceeded(limits, demands)):
             return made, limits, demands
+        spare_memory_maps()
         measured = limits if measure is None else measure()
         limits = widened(limits, measured, short)
 

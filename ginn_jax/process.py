@@ -6,12 +6,15 @@ import multiprocessing
 import os
 import threading
 from multiprocessing.process import BaseProcess
+from pathlib import Path
 
 import jax
 
 # Compiler options of what runs on several devices at once: with a device on every core
 # none has another to share a kernel with.
 ALONE = {"xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
+
+SHARE_OF_MAPS = 0.5
 
 # glibc's mallopt parameters, from malloc.h.
 TRIM_THRESHOLD, TOP_PAD, MMAP_MAX, ARENA_MAX = -1, -2, -4, -8
@@ -45,6 +48,20 @@ def forget_programs() -> None:
     """
     jax.clear_caches()
     gc.collect()
+
+
+def spare_memory_maps() -> None:
+    """Let go of all that JAX compiled where it has taken half of the memory maps.
+
+    Without any left LLVM ends the process. Where nothing tells, nothing happens.
+    """
+    try:
+        most = int(Path("/proc/sys/vm/max_map_count").read_bytes())
+        taken = Path("/proc/self/maps").read_bytes().count(b"\n")
+    except OSError:
+        return
+    if taken > SHARE_OF_MAPS * most:
+        forget_programs()
 
 
 def end_with_parent() -> None:
