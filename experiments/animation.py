@@ -156,7 +156,8 @@ def shade_frame(
         values[picture.row["method"]] = picture.values
     for name, trained in networks.items():
         values[name], networks[name] = network_values(trained, given, shot)
-    name, mean = mean_values(networks[OURS], given, shot, options.draws)
+    ours = values[OURS], networks[OURS]
+    name, mean = mean_values(*ours, given, shot, options.draws)
     values[name] = mean
     mask = shot.gbuffer.mask
     images = {n: fill(mask, np.asarray(v)) for n, v in values.items()}

@@ -18,7 +18,7 @@ from rich.console import Console
 from ginn_jax import compare, compare_report, report
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
-from ginn_jax.compare import Shot
+from ginn_jax.compare import Picture, Shot
 from ginn_jax.compare_networks import (
     OURS,
     Trained,
@@ -172,7 +172,8 @@ def compare_scene(
         if view == 0:
             shown = compare.displayed(shot, pictures)
             front += [p.row for p in pictures]
-            front += rivals(options, settings, shot, given, networks, units)
+            own = next(p for p in pictures if p.row["method"] == OURS)
+            front += rivals(options, settings, shot, given, own, networks, units)
             front += [
                 codes_kept(row) for row in front if row["method"] in (OURS, HALF_RATE)
             ]
@@ -184,6 +185,7 @@ def rivals(
     settings: Settings,
     shot: Shot,
     given: Any,
+    own: Picture,
     networks: dict[str, Trained],
     units: np.ndarray | None,
 ) -> list[Row]:
@@ -196,7 +198,8 @@ def rivals(
         variant = at_disk_radius(trained, radius)
         name = f"ours, disk {radius:.3g}"
         rows.append(network_picture(name, variant, given, shot)[0].row)
-    rows.append(mean_picture(networks[OURS], given, shot, options.draws, units).row)
+    ours = own, networks[OURS]
+    rows.append(mean_picture(*ours, given, shot, options.draws, units).row)
     for count in options.counts:
         seed = 1_000_003 + options.seed
         noisy = traced_picture(shot, settings, count, units, seed=seed)

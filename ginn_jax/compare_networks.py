@@ -12,14 +12,7 @@ from jaxtyping import Array, Float, Key
 from ginn_jax import evaluate, evaluate_light
 from ginn_jax.architecture import Network
 from ginn_jax.checkpoint import RECORD, damaged, read_record
-from ginn_jax.compare import (
-    Picture,
-    Shot,
-    Values,
-    errors,
-    of_variance,
-    scratch_mib,
-)
+from ginn_jax.compare import Picture, Shot, Values, errors, of_variance, scratch_mib
 from ginn_jax.dataset import ShadedPoints, count_given
 from ginn_jax.disk_radius import limits_at, with_disk_radius
 from ginn_jax.errors import InputError
@@ -91,9 +84,9 @@ def at_disk_radius(trained: Trained, radius: float) -> Trained:
 
 
 def redrawn(trained: Trained, draws: int) -> list[Trained]:
-    """The same network on so many draws of the Poisson disks, its own first."""
+    """The same network on other draws of the Poisson disks, so many with its own."""
     network, limits, (variables, key) = trained
-    keys = [key, *(jax.random.fold_in(key, n) for n in range(1, draws))]
+    keys = [jax.random.fold_in(key, n) for n in range(1, draws)]
     return [(network, limits, Model(variables, key)) for key in keys]
 
 
@@ -163,16 +156,17 @@ def network_picture(
 
 
 def mean_picture(
+    own: Picture,
     trained: Trained,
     cloud: ShadedPoints | LitCloud,
     shot: Shot,
     draws: int,
     units: Float[np.ndarray, "C"] | None,
 ) -> Picture:
-    """The mean over several draws of the Poisson disks, which costs the time of all."""
-    pictures = [
-        network_picture(OURS, own, cloud, shot)[0] for own in redrawn(trained, draws)
-    ]
+    """The mean of our network's own picture and those of other draws of the Poisson
+    disks, which costs the time of all."""
+    others = redrawn(trained, draws)
+    pictures = [own, *(network_picture(OURS, t, cloud, shot)[0] for t in others)]
     values = np.mean([p.values for p in pictures], axis=0)
     parts = "seconds_3d", "seconds_2d", "seconds"
     times = {part: sum(p.row[part] for p in pictures) for part in parts}
@@ -212,11 +206,15 @@ def network_values(
 
 
 def mean_values(
-    trained: Trained, cloud: ShadedPoints | LitCloud, shot: Shot, draws: int
+    own: Values,
+    trained: Trained,
+    cloud: ShadedPoints | LitCloud,
+    shot: Shot,
+    draws: int,
 ) -> tuple[str, Values]:
-    """The name and values of the mean over several draws of the disks, not timed."""
-    values = [network_values(own, cloud, shot)[0] for own in redrawn(trained, draws)]
-    return f"{OURS}, mean of {draws}", np.mean(values, axis=0)
+    """The same of values alone, not timed, and what the mean is called."""
+    others = [network_values(t, cloud, shot)[0] for t in redrawn(trained, draws)]
+    return f"{OURS}, mean of {draws}", np.mean([own, *others], axis=0)
 
 
 def network_memory(trained: Trained, points: int) -> float:
