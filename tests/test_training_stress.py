@@ -6,6 +6,7 @@ that is asked for it kills itself as the kernel would: SIGKILL, no handler, no f
 
 import json
 import os
+import random
 import shutil
 import signal
 import subprocess
@@ -153,10 +154,13 @@ def launch(folder, place, moment):
     """Whether a run in another process came to its end."""
     folder.mkdir(exist_ok=True)
     here = Path(__file__).parent
+    # Every life is a process, but they need not compile the same programs.
+    programs = {"JAX_COMPILATION_CACHE_DIR": str(folder.parent / "programs")}
+    programs |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
     paths = [str(here), str(here.parent), os.environ.get("PYTHONPATH", "")]
     done = subprocess.run(
         [sys.executable, __file__, folder, place, str(moment)],
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
+        env=os.environ | programs | {"PYTHONPATH": os.pathsep.join(paths)},
         capture_output=True,
         text=True,
         timeout=300,
@@ -191,9 +195,13 @@ def unbroken(tmp_path_factory):
     return folder
 
 
-# Before the first checkpoint; while the second is written and the first is whole;
-# with losses beyond the checkpoint; after steps that no checkpoint has.
-MOMENTS = [("rename", 3), ("writing.002", 2), ("files", 8), ("step", 8)]
+# Six at random; then before the first checkpoint of a life; while the second is written
+# and the first is whole; with losses beyond the checkpoint; after steps that none has.
+RANDOM = random.Random(6)
+MOMENTS = [
+    (RANDOM.choice(("step", "files", "rename")), RANDOM.randint(1, 5)) for _ in range(6)
+]
+MOMENTS += [("rename", 3), ("writing.002", 2), ("files", 8), ("step", 8)]
 
 
 def check_killed(folder, unbroken, moments):
