@@ -20,10 +20,9 @@ from ginn_jax.evaluate import Model, Row, View
 from ginn_jax.evaluate_light import LitView
 from ginn_jax.image import within_range
 from ginn_jax.inference import (
-    BLOCK,
-    block_size,
     encode_cloud,
     encode_whole,
+    largest_block,
     only,
     shade_block,
     shade_points,
@@ -240,7 +239,7 @@ def network_memory(trained: Trained, points: int) -> float:
     encoded, _ = jax.eval_shape(partial(encode_whole, *deep), *given)
     kept = sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(encoded.code))
     flat = network, only(limits, network.query.name), model.variables
-    rows = block_size(BLOCK, encoded.scale is not None)
+    rows = largest_block(encoded.scale is not None)
     block = shapes(rows, network.asks == "all")
     shaded = shade_block.lower(*flat, encoded, *block, coherent=True).compile()
     blocks = len(jax.devices()) * scratch_mib(shaded)

@@ -165,9 +165,16 @@ def without(limits: Limits, conv: str) -> Limits:
     return Limits(tuple(s for s in limits.sizes if not s[0].startswith(f"{conv}.")))
 
 
-def block_size(points: int, lit: bool) -> int:
+def largest_block(lit: bool) -> int:
     """Queries of a block: half as many where three colours share a core's cache."""
-    return min(BLOCK // 2 if lit else BLOCK, bucket(points))
+    return BLOCK // 2 if lit else BLOCK
+
+
+def block_size(points: int, lit: bool) -> int:
+    """Queries of a block such that all devices have about as many to do."""
+    most = largest_block(lit)
+    turns = -(-points // (most * jax.device_count()))
+    return min(most, bucket(-(-points // max(turns * jax.device_count(), 1))))
 
 
 def in_blocks(
@@ -241,7 +248,7 @@ def shade_points(
     finest = encoded.points, encoded.grid, encoded.area
     measure = partial(query_limits, network, finest, blocks, coherent)
     parts, sufficed, demands = with_room(limits, attempt, measure)
-    if len(blocks) > 1:  # a single one may be small
+    if 2 * size > largest_block(encoded.scale is not None):  # the next may be larger
         sufficed = fitted(sufficed, demands)
     say_raised(limits, sufficed)
     channels = () if encoded.scale is None else encoded.scale.shape

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments import evaluate as experiment
-from ginn_jax import checkpoint, compare_networks, inference, scenes
+from ginn_jax import checkpoint, inference, scenes
 from ginn_jax.compare_networks import OURS, redrawn
 from ginn_jax.compare_report import (
     RIVALS,
@@ -103,8 +103,7 @@ def finished_run(folder, network=tiny.ONE_LEVEL):
 def small_blocks(monkeypatch):
     monkeypatch.setattr(scenes, "ProcessPoolExecutor", tiny.Here)
     # Every picture has full blocks, so one shape is compiled.
-    for module in (inference, compare_networks):
-        monkeypatch.setattr(module, "BLOCK", 128)
+    monkeypatch.setattr(inference, "BLOCK", 128)
 
 
 def test_draws_are_distinct_and_none_is_the_networks_own():
