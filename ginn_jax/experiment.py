@@ -25,6 +25,7 @@ from ginn_jax.objects import SEEDS_APART, UNSEEN_SEED, Source
 from ginn_jax.pretrained import load_any, starting_weights
 from ginn_jax.process import available_cores, forget_programs
 from ginn_jax.train import Training
+from ginn_jax.upsample import shading_step
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class RunOptions:
     resolution: int = 256
     """Side of the evaluation images in pixels."""
     resolution_scale: float = 0.5
-    """Shade the evaluation images at this share of their resolution too; 1: do not."""
+    """Shade the evaluation images at 1/2, 1/3... of their resolution too; 1: do not."""
     seed: int = 0
     """Seed of everything."""
     start: str | None = None
@@ -69,10 +70,7 @@ def check_run(options: RunOptions, least: dict[str, int]) -> None:
     """Raise `InputError` for options that cannot be meant; `least` has more bounds."""
     bounds = {"shapes": 0, "test_shapes": 1, "points": 1000, "steps": 1, "batch": 1}
     require(options, bounds | {"resolution": 32, "seed": 0} | least)
-    if not 0 < options.resolution_scale <= 1:
-        raise InputError(
-            f"--resolution-scale is {options.resolution_scale}: give it in (0, 1]"
-        )
+    shading_step(options.resolution_scale)
     require_positive(options, "learning_rate")
     if options.start is not None:
         load_any(options.start)  # a name that is wrong is said before data are made

@@ -3,7 +3,7 @@
 A pixel is a point: points are shaded, in an order that keeps neighbours together.
 """
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
@@ -17,12 +17,12 @@ from ginn_jax.inference import shade_points
 from ginn_jax.limits import Limits, largest
 from ginn_jax.network import Variables
 from ginn_jax.shading import Encoded, numbers_asked
-from ginn_jax.upsample import Surface, sample_pixels, upsample
+from ginn_jax.upsample import Surface, sampled, shading_step, upsample
 
 # Cells of space that pixels are sorted into, in radii of f_2D.
 COARSE = 4.0
 
-_upsample = jax.jit(upsample)
+_upsample = jax.jit(upsample, static_argnums=1)
 
 
 @lru_cache(maxsize=8)
@@ -68,52 +68,62 @@ def shade_image(
 ) -> tuple[Float[np.ndarray, "H W *C"], Limits]:
     """An image; only the pixels in `mask` are computed. With light, one a channel.
 
-    Below a `resolution_scale` of 1 fewer are: the others are interpolated inside their
-    own surface, and computed where that is not possible (see `upsample`).
+    At a `resolution_scale` of 1/2, 1/3 or 1/4 fewer are: the others are interpolated
+    inside their own surface, and computed where that is not possible (see `upsample`).
 
     Raises:
-        InputError: a resolution scale outside (0, 1], arrays of unequal size, a mask
-            that is not of bool, or pixels in it that `shade_points` refuses.
+        InputError: another resolution scale, arrays of unequal size, a mask that is not
+            of bool, or pixels in it that `shade_points` refuses.
     """
-    check_image(position, normal, mask, background, resolution_scale)
-    mask = np.asarray(mask)
+    check_image(position, normal, mask, background)
+    step = shading_step(resolution_scale)
+    surface = Surface(*map(np.asarray, (position, normal, mask)))
+    numbers = numbers_asked(network, material, light)
     channels = () if encoded.scale is None else encoded.scale.shape
-    values = np.full((*mask.shape, *channels), background, np.float32)
-    material, light = numbers_asked(network, material, light)
-    pixel = coherent_pixels(position, mask, COARSE * network.query.radius)
-
-    def compute(wanted: Bool[np.ndarray, "H W"], limits: Limits) -> Limits:
-        rows = pixel[wanted.reshape(-1)[pixel]]
-        # `take` is three times as fast here as an index.
-        ends = (np.reshape(a, (-1, 3)).take(rows, axis=0) for a in (position, normal))
-        more = (
-            a if a is None else np.reshape(a, (len(a), mask.size, -1)).take(rows, 1)
-            for a in (material, light)
-        )
-        arrays = network, limits, variables, encoded
-        found, limits = shade_points(*arrays, *ends, *more, coherent=True)
-        values.reshape(-1, *channels)[rows] = within_range(encoded, found)
-        return limits
-
-    if resolution_scale == 1:
-        return values, compute(mask, limits)
-    places = tuple(sample_pixels(n, resolution_scale) for n in mask.shape)
-    sampled = np.zeros_like(mask)
-    sampled[np.ix_(*places)] = mask[np.ix_(*places)]
-    limits = largest(limits, compute(sampled, limits))
-    surface, thickness = Surface(position, normal, mask), 0.2 * network.query.radius
-    given = values[np.ix_(*places)], *places, surface, thickness
-    between, known = map(np.asarray, _upsample(*given))
-    rest = mask & ~sampled
-    filled = (rest & known).reshape(*mask.shape, *(1 for _ in channels))
-    np.copyto(values, between, where=filled)
-    return values, compute(rest & ~known, limits)
+    values = np.full((*surface.mask.shape, *channels), background, np.float32)
+    shade = partial(_shade_pixels, network, variables, encoded)
+    if step == 1:
+        return shade(surface, numbers, values, limits)
+    places = tuple(sampled(n, step) for n in surface.mask.shape)
+    fewer = Surface(*(a[places] for a in surface))
+    own = tuple(a if a is None else a[:, *places] for a in numbers)
+    coarse, sufficed = shade(fewer, own, values[places], limits)
+    thickness = np.float32(0.2 * network.query.radius)
+    between, known = map(np.asarray, _upsample(coarse, step, surface, thickness))
+    np.copyto(values, between, where=known[..., None] if channels else known)
+    values[places] = coarse
+    rest = surface._replace(mask=surface.mask & ~known)
+    values, more = shade(rest, numbers, values, largest(limits, sufficed))
+    return values, largest(sufficed, more)
 
 
-def check_image(
-    position: Any, normal: Any, mask: Any, background: float, resolution_scale: float
-) -> None:
-    """Raise `InputError` for what is no G-buffer, or no way to shade one."""
+def _shade_pixels(
+    network: Network,
+    variables: Variables,
+    encoded: Encoded,
+    surface: Surface,
+    numbers: tuple[Float[np.ndarray, "C H W _"] | None, ...],
+    values: Float[np.ndarray, "H W *C"],
+    limits: Limits,
+) -> tuple[Float[np.ndarray, "H W *C"], Limits]:
+    """`values` with those of the pixels in the mask; `numbers`: material and light."""
+    position, normal, mask = surface
+    rows = coherent_pixels(position, mask, COARSE * network.query.radius)
+    # `take` is three times as fast here as an index.
+    ends = (np.reshape(a, (-1, 3)).take(rows, axis=0) for a in (position, normal))
+    more = (
+        a if a is None else np.reshape(a, (len(a), mask.size, -1)).take(rows, 1)
+        for a in numbers
+    )
+    arrays = network, limits, variables, encoded
+    found, limits = shade_points(*arrays, *ends, *more, coherent=True)
+    values = np.array(values, order="C")
+    values.reshape(-1, *values.shape[2:])[rows] = within_range(encoded, found)
+    return values, limits
+
+
+def check_image(position: Any, normal: Any, mask: Any, background: float) -> None:
+    """Raise `InputError` for what is no G-buffer, or no background for one."""
     mask = np.asarray(mask)
     if mask.dtype != bool or mask.ndim != 2:
         raise InputError(f"mask is {mask.dtype} {mask.shape}: give bool [H W]")
@@ -123,8 +133,6 @@ def check_image(
             f"position {np.shape(position)} and normal {np.shape(normal)} do not fit "
             f"the mask {mask.shape}: give [H W 3]"
         )
-    if not 0 < resolution_scale <= 1:
-        raise InputError(f"resolution scale {resolution_scale}: give it in (0, 1]")
 
 
 def within_range(

@@ -4,17 +4,22 @@ Only every so manieth pixel is shaded. A pixel in between takes the mean of the 
 shaded ones around it, weighted by how well they lie in its own surface, so no value
 crosses an edge of depth or normal. Where none of them does, the pixel has no value and
 has to be shaded itself: borders neither darken nor bleed.
+
+Pixels that lie alike between the shaded ones are taken together, as a smaller image:
+what is done is then done to whole images side by side, without an index.
 """
 
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Shaped
+
+from ginn_jax.errors import InputError
 
 SHARPNESS = 8
 LEAST_WEIGHT = 0.05
+COARSEST = 4
 
 
 class Surface(NamedTuple):
@@ -25,65 +30,120 @@ class Surface(NamedTuple):
     mask: Bool[Any, "H W"]
 
 
-def sample_pixels(size: int, scale: float) -> Int[np.ndarray, "S"]:
-    """The pixels of a row that are shaded at a resolution scale in (0, 1]."""
-    count = max(round(size * scale), 1)
-    return ((np.arange(count) + 0.5) * size / count).astype(np.int32)
+def shading_step(scale: float) -> int:
+    """Pixels from one that is shaded to the next, at a scale of 1, 1/2, 1/3 or 1/4.
+
+    Raises:
+        InputError: any other scale.
+    """
+    step = round(1 / scale) if 0.9 / COARSEST < scale <= 1 else 0
+    if not abs(step * scale - 1) < 0.01:
+        raise InputError(
+            f"resolution scale {scale}: give 1 over a whole number up to {COARSEST}, "
+            "as 1, .5 or .333"
+        )
+    return step
+
+
+def sampled(size: int, step: int) -> slice:
+    """The pixels of a row that are shaded; there is at least one."""
+    return slice(min(step // 2, size - 1), size, step)
 
 
 def upsample(
     values: Float[Array, "h w *C"],
-    rows: Int[Array, "h"],
-    columns: Int[Array, "w"],
+    step: int,
     surface: Surface,
     thickness: Float[Array, ""],
 ) -> tuple[Float[Array, "H W *C"], Bool[Array, "H W"]]:
-    """Values of all pixels from those at `rows` x `columns`, and which have one.
+    """Values of all pixels from those `sampled` at a step, and which have one.
 
     `thickness` is how far a sample may lie off a pixel's tangent plane, as a standard
     deviation in units of length. Values where there is none are 0.
     """
-    height, width = surface.mask.shape
-    above, down = _between(rows, height)
-    left, right = _between(columns, width)
-    channels = tuple(range(2, values.ndim))
-    total = jnp.zeros((height, width, *values.shape[2:]))
-    weight = jnp.zeros((height, width))
-    for j, share_j in ((left, 1 - right), (left + 1, right)):
-        j = jnp.clip(j, 0, columns.size - 1)
-        column = jax.tree.map(lambda a: a[rows][:, columns[j]], surface)  # noqa: B023
-        # Columns first and once: they cost much more than the rows, which are whole.
-        column = jax.lax.optimization_barrier((*column, values[:, j]))
-        for i, share_i in ((above, 1 - down), (above + 1, down)):
-            i = jnp.clip(i, 0, rows.size - 1)
-            *there, value = (a[i] for a in column)
-            share = _likeness(surface, Surface(*there), thickness)
-            share = share * share_i[:, None] * share_j
-            total += jnp.expand_dims(share, channels) * value
-            weight += share
-    known = surface.mask & (weight > LEAST_WEIGHT)
-    inverse = jnp.where(known, 1 / jnp.where(known, weight, 1.0), 0.0)
-    return total * jnp.expand_dims(inverse, channels), known
+    shape = surface.mask.shape
+    places = tuple(sampled(n, step) for n in shape)
+    samples = Surface(*(_beyond_borders(a[places]) for a in surface))
+    lights = values.reshape(*values.shape[:2], -1)
+    lights = [_beyond_borders(lights[..., c]) for c in range(lights.shape[2])]
+    parts = []
+    for row in range(step):
+        for column in range(step):
+            here = Surface(*(a[row::step, column::step] for a in surface))
+            above = _around(row, places[0].start, step, shape[0])
+            left = _around(column, places[1].start, step, shape[1])
+            parts.append(_between(here, samples, lights, above, left, thickness))
+    found, known = (_interleaved(p, step, shape) for p in zip(*parts, strict=True))
+    return found.reshape(*shape, *values.shape[2:]), known[..., 0]
+
+
+Ends = list[tuple[slice, float]]
+
+
+def _around(place: int, start: int, step: int, size: int) -> Ends:
+    """The samples before and after the pixels of a row from `place` on, every `step`.
+
+    As slices of the samples `_beyond_borders`, each with its share; none without one.
+    """
+    count = len(range(place, size, step))
+    first, share = divmod(place - start, step)
+    ends = [(first + 1, 1 - share / step), (first + 2, share / step)]
+    return [(slice(i, i + count), part) for i, part in ends if part]
+
+
+def _beyond_borders(samples: Shaped[Array, "h w *C"]) -> Shaped[Array, "n m *C"]:
+    """Samples with those at the border again beyond it."""
+    around = ((1, 1), (1, 1)) + ((0, 0),) * (samples.ndim - 2)
+    # By itself, or it is done anew for every pixel that looks.
+    return jax.lax.optimization_barrier(jnp.pad(samples, around, mode="edge"))
 
 
 def _between(
-    samples: Int[Array, "s"], size: int
-) -> tuple[Int[Array, "S"], Float[Array, "S"]]:
-    """The last sample before every pixel (-1: none), and how far on it is."""
-    pixel = jnp.arange(size)
-    before = jnp.searchsorted(samples, pixel, side="right").astype(jnp.int32) - 1
-    start = samples[jnp.maximum(before, 0)]
-    stop = samples[jnp.minimum(before + 1, samples.size - 1)]
-    share = (pixel - start) / jnp.maximum(stop - start, 1)
-    return before, jnp.clip(share, 0.0, 1.0)
+    here: Surface,
+    samples: Surface,
+    lights: list[Float[Array, "n m"]],
+    above: Ends,
+    left: Ends,
+    thickness: Float[Array, ""],
+) -> tuple[Float[Array, "H W C"], Bool[Array, "H W 1"]]:
+    """Values of pixels that all lie alike between their samples."""
+    total, weight = [jnp.float32(0)] * len(lights), jnp.float32(0)
+    for rows, share_i in above:
+        for columns, share_j in left:
+            there = Surface(*(a[rows, columns] for a in samples))
+            like = share_i * share_j * _likeness(here, there, thickness)
+            pairs = zip(total, lights, strict=True)
+            total = [t + like * light[rows, columns] for t, light in pairs]
+            weight += like
+    known = here.mask & (weight > LEAST_WEIGHT)
+    inverse = jnp.where(known, 1 / jnp.where(known, weight, 1.0), 0.0)
+    return jnp.stack([t * inverse for t in total], axis=-1), known[..., None]
+
+
+def _interleaved(
+    parts: tuple[Shaped[Array, "..."], ...], step: int, shape: tuple[int, int]
+) -> Shaped[Array, "H W C"]:
+    """One image of those of which each has every so manieth pixel."""
+    high, wide = (-(-n // step) for n in shape)
+    filled = [
+        jnp.pad(a, ((0, high - a.shape[0]), (0, wide - a.shape[1]), (0, 0)))
+        for a in parts
+    ]
+    grid = jnp.stack(filled).reshape(step, step, high, wide, -1)
+    image = jax.lax.optimization_barrier(grid).transpose(2, 0, 3, 1, 4)
+    image = image.reshape(high * step, wide * step, -1)
+    return image[: shape[0], : shape[1]]
 
 
 def _likeness(
     here: Surface, there: Surface, thickness: Float[Array, ""]
 ) -> Float[Array, "H W"]:
     """1 for a sample in the pixel's own tangent plane, near 0 for another surface."""
-    offset = there.position - here.position
-    off_plane = jnp.sum(offset * here.normal, axis=-1) / thickness
-    turned = jnp.maximum(jnp.sum(here.normal * there.normal, axis=-1), 0.0)
-    likeness = jnp.exp(-0.5 * off_plane**2) * turned**SHARPNESS
+    off_plane = turned = jnp.float32(0)
+    for axis in range(3):
+        offset = there.position[..., axis] - here.position[..., axis]
+        off_plane += offset * here.normal[..., axis]
+        turned += there.normal[..., axis] * here.normal[..., axis]
+    likeness = jnp.exp(-0.5 * (off_plane / thickness) ** 2)
+    likeness *= jnp.maximum(turned, 0.0) ** SHARPNESS
     return jnp.where(there.mask & here.mask, likeness, 0.0)

@@ -76,7 +76,7 @@ TABLE: Table = {
         ({"mask": np.ones((2, 5), bool)}, r"do not fit the mask \(2, 5\)"),
         ({"normal": UP}, r"normal \(20, 3\) do not fit the mask"),
         ({"background": NAN}, "background nan must be"),
-        ({"resolution_scale": 0.0}, r"resolution scale 0.0: give it in \(0, 1\]"),
+        ({"resolution_scale": 0.0}, "resolution scale 0.0: give 1 over a whole number"),
         ({"resolution_scale": NAN}, "resolution scale nan: give"),
     ],
     metrics.mse: [

@@ -209,7 +209,7 @@ def ends(monkeypatch, capsys, script, *words, main=None):
         (("--seed", "-1"), "--seed is -1"),
         (("--seed", "100"), "--seed 100"),
         (("--learning-rate", "nan"), "--learning-rate is nan: give it above 0"),
-        (("--resolution-scale", "0"), r"--resolution-scale is 0\.0: give it in"),
+        (("--resolution-scale", "0"), r"resolution scale 0\.0: give 1 over"),
         (("--preset", "none"), "--preset"),
         (("--no-such-option",), "no-such-option"),
         (("--test-meshes", "gone"), "gone: no such file or folder"),

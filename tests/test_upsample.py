@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from ginn_jax.upsample import Surface, sample_pixels, upsample
+from ginn_jax.upsample import COARSEST, Surface, sampled, shading_step, upsample
 
 SIZE = 16
-lift = jax.jit(upsample)
+lift = jax.jit(upsample, static_argnums=1)
 UP = np.array([0.0, 1, 0], np.float32)
 
 
@@ -21,35 +21,83 @@ def plane(height=0.0, normal=UP):
     return Surface(position, np.broadcast_to(normal, position.shape), x >= 0)
 
 
-def lifted(values, surface, rows, thickness=0.005):
-    return jax.tree.map(
-        np.asarray, lift(values, rows, rows, surface, np.float32(thickness))
-    )
+def lifted(values, step, surface, thickness=0.005):
+    return jax.tree.map(np.asarray, lift(values, step, surface, np.float32(thickness)))
 
 
-@given(st.integers(1, 300), st.floats(0.01, 1))
-def test_samples_are_distinct_pixels_in_order(size, scale):
-    samples = sample_pixels(size, scale)
-    assert samples[0] >= 0
-    assert samples[-1] < size
-    assert (np.diff(samples) > 0).all()
-    assert len(samples) == max(round(size * scale), 1)
+@given(st.integers(1, 300), st.integers(1, COARSEST))
+def test_every_so_manieth_pixel_is_shaded(size, step):
+    """At least one is, and no pixel is further than a step from one."""
+    rows = np.arange(size)[sampled(size, step)]
+    assert (np.diff(rows) == step).all()
+    assert rows[0] == min(step // 2, size - 1)
+    assert size - rows[-1] <= step
+    assert shading_step(1 / step) == step
+
+
+# Few, for each is compiled: sides that are and are not multiples, or below a step.
+SIZES = [((7, 6), 2, 1), ((6, 11), 3, 2), ((1, 9), 4, 3), ((2, 2), 5, 1)]
+
+
+@given(st.sampled_from(SIZES), st.data())
+def test_agrees_with_one_pixel_at_a_time(size, data):
+    """The definition, with an index for every pixel and in float64."""
+
+    def draw(shape):
+        unit = st.floats(0, 1, width=32)
+        return data.draw(hnp.arrays(np.float32, shape, elements=unit))
+
+    shape, step, channels = size
+    position, mask = draw((*shape, 3)), draw(shape) < 0.8
+    normal = draw((*shape, 3)) + np.float32(0.1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    rows, columns = (np.arange(n)[sampled(n, step)] for n in shape)
+    values = draw((len(rows), len(columns), channels))
+    surface = Surface(position, normal, mask)
+    found, known = lifted(values, step, surface, 0.3)
+    for place in np.ndindex(shape):
+        total, weight = one_pixel(values, rows, columns, surface, place, 0.3)
+        assert known[place] == (weight > 0.05) or abs(weight - 0.05) < 1e-5
+        wanted = total / weight if known[place] else 0 * total
+        np.testing.assert_allclose(found[place], wanted, rtol=1e-4, atol=1e-6)
+
+
+def one_pixel(values, rows, columns, surface, place, thickness):
+    """Weighted values of the samples around a pixel, and the sum of their weights."""
+    total, weight = np.zeros(values.shape[2]), 0.0
+    here = [np.float64(a[place]) for a in surface]
+    for i, share_i in around(rows, place[0]):
+        for j, share_j in around(columns, place[1]):
+            there = [np.float64(a[rows[i], columns[j]]) for a in surface]
+            off = (there[0] - here[0]) @ here[1] / thickness
+            like = np.exp(-0.5 * off**2) * max(there[1] @ here[1], 0.0) ** 8
+            like *= share_i * share_j * here[2] * there[2]
+            total, weight = total + like * values[i, j], weight + like
+    return total, weight
+
+
+def around(samples, pixel):
+    """The samples on both sides of a pixel of a row, and how much each counts."""
+    after = np.searchsorted(samples, pixel, side="right")
+    if after in (0, len(samples)):
+        return [(min(after, len(samples) - 1), 1.0)]
+    share = (pixel - samples[after - 1]) / (samples[after] - samples[after - 1])
+    return [(after - 1, 1 - share), (after, share)]
 
 
 @given(hnp.arrays(np.float32, (8, 8), elements=st.floats(0, 1, width=32)))
 def test_values_stay_within_those_around_and_samples_keep_theirs(values):
-    rows = sample_pixels(SIZE, 0.5)
-    found, known = lifted(values, plane(), rows)
+    found, known = lifted(values, 2, plane())
     assert known.all()
-    np.testing.assert_allclose(found[np.ix_(rows, rows)], values, atol=1e-6)
+    np.testing.assert_allclose(found[1::2, 1::2], values, atol=1e-6)
     assert found.min() >= values.min() - 1e-6
     assert found.max() <= values.max() + 1e-6
 
 
 def test_a_linear_ramp_is_interpolated_exactly():
-    rows = sample_pixels(SIZE, 0.5)
+    rows = np.arange(SIZE)[sampled(SIZE, 2)]
     ramp = np.add.outer(2.0 * rows, 3.0 * rows).astype(np.float32)
-    found, _ = lifted(ramp, plane(), rows)
+    found, _ = lifted(ramp, 2, plane())
     inner = np.arange(rows[0], rows[-1] + 1)
     expected = np.add.outer(2.0 * inner, 3.0 * inner)
     np.testing.assert_allclose(found[np.ix_(inner, inner)], expected, rtol=1e-5)
@@ -66,10 +114,10 @@ def test_nothing_crosses_an_edge(edge):
         np.where(left[None, :, None], a, b)
         for a, b in zip(low[:2], high[:2], strict=True)
     )
-    rows = sample_pixels(SIZE, 0.5)
+    rows = np.arange(SIZE)[sampled(SIZE, 2)]
     values = np.where(left[rows], 0.0, 1.0) * np.ones((8, 1))
     surface = Surface(position, normal, low.mask)
-    found, known = lifted(values.astype(np.float32), surface, rows)
+    found, known = lifted(values.astype(np.float32), 2, surface)
     expected = np.broadcast_to(np.where(left, 0.0, 1.0), known.shape)
     np.testing.assert_allclose(found[known], expected[known], atol=1e-3)
     assert known.mean() > 0.9
@@ -79,9 +127,9 @@ def test_background_neither_darkens_nor_is_given_values():
     """The background of a coarse image holds nonsense: nobody may see it."""
     surface = plane()
     mask = np.arange(SIZE)[None, :] + np.zeros((SIZE, 1)) < 9
-    rows = sample_pixels(SIZE, 0.5)
+    rows = np.arange(SIZE)[sampled(SIZE, 2)]
     values = np.where(mask[np.ix_(rows, rows)], 0.5, -1e6).astype(np.float32)
-    found, known = lifted(values, surface._replace(mask=mask), rows)
+    found, known = lifted(values, 2, surface._replace(mask=mask))
     assert not known[~mask].any()
     np.testing.assert_allclose(found[known], 0.5, rtol=1e-6)
     assert known[mask].all()
@@ -90,12 +138,11 @@ def test_background_neither_darkens_nor_is_given_values():
 def test_a_pixel_of_no_sample_is_left_to_be_shaded():
     """A thin bar between the samples belongs to none of them."""
     surface, raised = plane(), plane(0.3)
-    rows = sample_pixels(SIZE, 0.25)
+    rows = np.arange(SIZE)[sampled(SIZE, 4)]
     bar = np.arange(SIZE) == rows[1] + 1
     position = np.where(bar[None, :, None], raised.position, surface.position)
-    found, known = lifted(
-        np.ones((4, 4), np.float32), surface._replace(position=position), rows
-    )
+    ones = np.ones((4, 4), np.float32)
+    found, known = lifted(ones, 4, surface._replace(position=position))
     assert not known[:, bar].any()
     assert known[:, ~bar].all()
     assert (found[:, bar] == 0).all()
