@@ -32,6 +32,7 @@ from ginn_jax.receptive_field import Oriented
 from ginn_jax.reference import GBuffer, Scene
 from ginn_jax.searches import uniform_limits
 from ginn_jax.train import Training, init_state
+from ginn_jax.upsample import shading_step
 
 UNSEEN_SEED = 20_000_000
 # The paper's AO, whole network, 1024 x 1024, NVIDIA GTX 1080.
@@ -58,7 +59,7 @@ class Options:
     """Width of the kernel perceptron."""
     rays: tuple[int, ...] = (1, 4, 10, 16)
     """Rays per pixel of the ray-traced frames."""
-    scales: tuple[float, ...] = (0.5,)
+    scales: tuple[float, ...] = (0.5, 0.333)
     """Resolution scales to time beside full rate."""
     repeats: int = 9
     """Timed calls of each variant."""
@@ -67,7 +68,7 @@ class Options:
 
 
 QUICK = {"resolution": 128, "disks": (0.02,), "radii": (0.05,), "rays": (1,)}
-QUICK |= {"repeats": 2}
+QUICK |= {"scales": (0.5,), "repeats": 2}
 
 
 def make_frame(options: Options) -> tuple[Scene, GBuffer]:
@@ -139,7 +140,9 @@ def compare(
     if difference > 1e-4:
         raise AssertionError(f"results differ by {difference}")
     calls: dict[str, Callable[[], Any]] = {"ours": ours, "straightforward": plain}
-    calls |= {f"ours, scale {s:g}": partial(ours, s) for s in options.scales}
+    calls |= {
+        f"ours, scale 1/{shading_step(s)}": partial(ours, s) for s in options.scales
+    }
     for rays in options.rays:
         calls[f"{rays} rays"] = partial(
             reference.ambient_occlusion,

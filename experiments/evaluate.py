@@ -38,11 +38,11 @@ from ginn_jax.evaluate import Row
 from ginn_jax.experiment import make
 from ginn_jax.objects import Source
 from ginn_jax.scenes import Settings, cloud_origin
+from ginn_jax.upsample import shading_step
 
 TITLES = {"ao": "Ambient occlusion", "gi": "Global illumination"}
 TITLES |= {"sss": "Subsurface scattering"}
 TARGET_PATHS = 1024
-HALF_RATE = f"{OURS}, scale 0.5"
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,8 @@ class Options:
     """Rays or paths per pixel of the traced rivals."""
     disks: tuple[float, ...] = (0.75, 1.5)
     """Poisson disk radii at which our network runs beside its own, as times that."""
+    scales: tuple[float, ...] = (0.5, 0.333)
+    """Shares of the resolution at which our network shades as well."""
     draws: int = 4
     """Draws of the Poisson disks over which our network's mean is taken beside it."""
     points: int | None = None
@@ -91,13 +93,15 @@ class Options:
 
 
 QUICK = {"objects": 1, "views": 1, "resolution": 64, "reference": 16, "points": 4000}
-QUICK |= {"counts": (1, 4), "disks": (), "draws": 2}
+QUICK |= {"counts": (1, 4), "disks": (), "scales": (0.5,), "draws": 2}
 
 
 def main(options: Options) -> dict[str, Any]:
     """Run the comparison; returns what metrics.json holds."""
     least = {"objects": 1, "views": 1, "resolution": 32, "reference": 2, "seed": 0}
     require(options, least | {"points": 1000, "looks": 1, "draws": 2})
+    for scale in options.scales:
+        shading_step(scale)
     console = Console()
     targets = 64 if options.quick else TARGET_PATHS
     given = options.effect, options.points, targets, options.radius
@@ -174,10 +178,14 @@ def compare_scene(
             front += [p.row for p in pictures]
             own = next(p for p in pictures if p.row["method"] == OURS)
             front += rivals(options, settings, shot, given, own, networks, units)
-            front += [
-                codes_kept(row) for row in front if row["method"] in (OURS, HALF_RATE)
-            ]
+            rates = OURS, *(at_scale(scale) for scale in options.scales)
+            front += [codes_kept(row) for row in front if row["method"] in rates]
     return rows, front, shown, networks
+
+
+def at_scale(scale: float) -> str:
+    """What our network is called where it shades fewer pixels."""
+    return f"{OURS}, scale 1/{shading_step(scale)}"
 
 
 def rivals(
@@ -190,9 +198,11 @@ def rivals(
     units: np.ndarray | None,
 ) -> list[Row]:
     """Our network at other rates and radii, and tracing, plain and denoised."""
-    trained = networks[OURS]
-    picture, networks[OURS] = network_picture(HALF_RATE, trained, given, shot, 0.5)
-    rows = [picture.row]
+    trained, rows = networks[OURS], []
+    for scale in options.scales:
+        called = at_scale(scale), networks[OURS]
+        picture, networks[OURS] = network_picture(*called, given, shot, scale)
+        rows.append(picture.row)
     for times in options.disks:
         radius = times * trained[0].levels[0]
         variant = at_disk_radius(trained, radius)

@@ -134,6 +134,7 @@ def test_f2d(tmp_path, monkeypatch):
         points=700,
         disks=(0.08,),
         radii=(0.16,),
+        scales=(0.5,),
         rays=(1,),
         repeats=1,
     )
@@ -144,7 +145,7 @@ def test_f2d(tmp_path, monkeypatch):
     assert case["block_bytes"] > 0
     assert set(case["timings"]) == {
         "ours",
-        "ours, scale 0.5",
+        "ours, scale 1/2",
         "straightforward",
         "1 rays",
     }

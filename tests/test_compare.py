@@ -144,7 +144,7 @@ def test_light_is_compared_with_tracing_plain_and_denoised(tmp_path, monkeypatch
     found = experiment.main(options)
     rows = {row["method"]: row for row in found["error_against_time"]}
     assert rows["ours, mean of 2"]["seconds"] > rows[OURS]["seconds_3d"]
-    assert {"ours, disk 0.06", "ours, scale 0.5", "3D only"} <= set(rows)
+    assert {"ours, disk 0.06", "ours, scale 1/2", "3D only"} <= set(rows)
     kept = rows["ours, codes kept"]
     assert kept["mse_2d"] == rows[OURS]["mse_2d"]
     assert kept["seconds"] == rows[OURS]["seconds_2d"] < rows[OURS]["seconds"]
