@@ -76,6 +76,27 @@ def equal_rays(error: float, per_ray_variance: float) -> float:
     return float(per_ray_variance) / float(error) if error > 0 else float("inf")
 
 
+def equal_tracing(
+    error: float, seconds: float, traced: Sequence[tuple[int, float, float]]
+) -> tuple[float, float, float]:
+    """What ray tracing comes to beside a method of this MSE and time.
+
+    `traced` are the count of rays or paths a pixel, MSE and time of two runs at least.
+    An MSE is taken to fall as 1 / count, from the smallest, and times to be a line.
+
+    Returns the count and the time at equal MSE, and the ratio of the MSEs, tracing over
+    the method's, at equal time, or at one ray where there is time for less.
+    """
+    if len({count for count, _, _ in traced}) < 2 or not error > 0:
+        raise InputError(f"tracing beside MSE {error}: give two counts, an MSE over 0")
+    counts, errors, times = np.array(sorted(traced), np.float64).T
+    single = float(errors[0] * counts[0])
+    slope, start = np.polyfit(counts, times, 1)
+    affordable = max((seconds - start) / slope, 1.0) if slope > 0 else 1.0
+    equal = single / error
+    return equal, float(start + slope * equal), float(single / affordable / error)
+
+
 def tone_map(image: Image, reference: Image, mask: Mask | None = None) -> Image:
     """Linear [H W] or [H W 3] to display values in [0, 1], after the paper's appendix.
 

@@ -20,7 +20,7 @@ from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
 from ginn_jax.files import writing
-from ginn_jax.metrics import tone_map
+from ginn_jax.metrics import equal_tracing, tone_map
 from ginn_jax.process import available_cores
 
 RESULTS = ("metrics.json", "report.md")
@@ -91,6 +91,24 @@ def table_of(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> s
     """A table of some columns of result rows: {key: heading}; a dash where missing."""
     cells = [[row.get(key, "-") for key in columns] for row in rows]
     return markdown_table(list(columns.values()), cells)
+
+
+def beside_tracing(
+    network: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], count: str
+) -> str:
+    """What tracing needs for the network's 2D MSE, and has in its time, if known.
+
+    Traced rows are those with the key `count`.
+    """
+    traced = [(r[count], r["mse_2d"], r["seconds"]) for r in rows if count in r]
+    error, seconds = network["mse_2d"], network["seconds"]
+    if len(traced) < 2 or min(error, min(traced)[1]) <= 0:
+        return ""
+    equal, longer, ratio = equal_tracing(error, seconds, traced)
+    return f"""Tracing needs {equal:.3g} rays or paths a pixel for the network's 2D MSE,
+which take {longer:.2g} s; in the network's time it has {ratio:.2g} times that MSE.
+
+"""
 
 
 def draw_curve(path: Path, losses: Float[np.ndarray, "S"], floor: float) -> None:

@@ -171,3 +171,21 @@ def test_what_does_not_fit_is_refused(b, mask, message, unchecked):
 def test_dssim_refuses_small_images():
     with pytest.raises(InputError, match="11 pixels"):
         metrics.dssim(np.zeros((10, 20)), np.zeros((10, 20)))
+
+
+@given(st.floats(1e-3, 1e3), st.floats(0, 1), st.floats(1e-3, 1), st.floats(1e-6, 1e3))
+def test_tracing_at_equal_error_and_at_equal_time(single, start, slope, error):
+    """Where MSE is single / count and time start + slope count, by hand."""
+    traced = [(n, single / n, start + slope * n) for n in (16, 1, 4)]
+    equal, seconds, ratio = metrics.equal_tracing(error, start + 8 * slope, traced)
+    assert equal == pytest.approx(single / error)
+    assert seconds == pytest.approx(start + slope * single / error, rel=1e-6)
+    assert ratio == pytest.approx(single / 8 / error, rel=1e-6)
+    at_once = metrics.equal_tracing(error, 0.0, traced)
+    assert at_once[2] == pytest.approx(single / error)
+
+
+@pytest.mark.parametrize(("error", "counts"), [(0.0, (1, 4)), (0.1, (4, 4)), (0.1, ())])
+def test_tracing_beside_nothing_is_refused(error, counts):
+    with pytest.raises(InputError, match="give two counts, an MSE over 0"):
+        metrics.equal_tracing(error, 1.0, [(n, 1.0, 1.0) for n in counts])
