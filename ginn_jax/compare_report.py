@@ -97,9 +97,7 @@ def write_report(title: str, m: Mapping[str, Any]) -> str:
     times |= {"seconds": "total s", "memory_mib": "memory MiB"}
     against = {"method": "method", "seconds": "s", "mse_2d": "2D MSE"}
     against |= {"relative_mse_2d": "relative 2D", "dssim_2d": "2D DSSIM"}
-    rows = m["error_against_time"]
-    own = next(row for row in rows if row["method"] == OURS)
-    beside = report.beside_tracing(own, rows, "traced")
+    rows = report.beside_tracing(m["error_against_time"], "traced")
     lost = "\n".join(f"- {line}" for line in m["lost_cells"]) or "None."
     denoiser = "" if m["denoiser"] else " Open Image Denoise was not installed."
     return f"""# {title}
@@ -135,8 +133,8 @@ f_2D takes {m["share_2d"]:.0%} of our network's time (paper: 60 %).
 Over the first view of every scene.{denoiser} Codes kept: the time of another view of
 the same scene in the same light, f_2D alone.
 
-{report.table_of(rows, against)}
-{beside}Pareto front by 2D MSE: {", ".join(m["front_mse"])}.
+{report.table_of(rows, against | report.TRACING)}
+Pareto front by 2D MSE: {", ".join(m["front_mse"])}.
 By DSSIM: {", ".join(m["front_dssim"])}. By 2D MSE where codes
 are kept: {", ".join(m["front_kept"])}.
 

@@ -49,8 +49,7 @@ def write_report(title: str, m: dict[str, Any]) -> str:
     seconds = {k[8:]: v for k, v in m.items() if k.startswith("seconds_")}
     network = m["training"]["network"]
     kind = "linear in light" if network["linear"] else "homogeneous in light"
-    against = m["error_against_time"]
-    beside = report.beside_tracing(against[0], against, "paths")
+    against = report.beside_tracing(m["error_against_time"], "paths")
     return f"""# {title}
 
 Network {kind}, levels {network["levels"]}, f_2D radius {network["query"]["radius"]},
@@ -76,8 +75,8 @@ machine, same run; compilation, G-buffer and direct light apart. The reference h
 {m["reference_paths"]} paths a pixel, whose noise is subtracted. DSSIM of what is
 displayed, after the paper's tone mapping, over the foreground.
 
-{report.table_of(against, times)}
-{beside}![error against run time](error_against_time.png)
+{report.table_of(against, times | report.TRACING)}
+![error against run time](error_against_time.png)
 
 ![reference and network](views.png)
 

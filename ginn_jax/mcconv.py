@@ -183,9 +183,9 @@ def _convolve_backward(
     combine: Any,
     receivers: int,
     outputs: int,
-    inputs: tuple[Kernel, Float[Array, "N C"], Field],
+    inputs: tuple[Kernel | None, Float[Array, "N C"], Field],
     cotangent: Float[Array, "M K"],
-) -> tuple[Kernel, Float[Array, "N C"], Field]:
+) -> tuple[Kernel | None, Float[Array, "N C"], Field]:
     """Cotangents of kernel, features, kernel inputs and weights, tile by tile."""
     kernel, features, field = inputs
 

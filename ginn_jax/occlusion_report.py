@@ -20,8 +20,7 @@ def write_report(m: dict[str, Any]) -> str:
     heads |= {"median_relative_mse_3d": "median relative", "equal_rays": "equal rays"}
     env, options = m["environment"], m["options"]
     seconds = {k[8:]: v for k, v in m.items() if k.startswith("seconds_")}
-    against = m["error_against_time"]
-    beside = report.beside_tracing(against[0], against, "rays")
+    against = report.beside_tracing(m["error_against_time"], "rays")
     return f"""# Ambient occlusion
 
 Preset {options["preset"]}, levels {m["training"]["network"]["levels"]}, f_2D radius
@@ -46,8 +45,8 @@ Means over {len(m["foreground_pixels"])} unseen objects at {options["resolution"
 pixels), same pixels, same machine, same run; compilation and G-buffer apart. DSSIM
 after the paper's tone mapping, over the foreground.
 
-{report.table_of(against, times)}
-{beside}![error against run time](error_against_time.png)
+{report.table_of(against, times | report.TRACING)}
+![error against run time](error_against_time.png)
 
 ![reference, network, difference](views.png)
 

@@ -25,6 +25,12 @@ from ginn_jax.process import available_cores
 
 RESULTS = ("metrics.json", "report.md")
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "mitsuba", "trimesh")
+# What `beside_tracing` adds to a row, and what it is called.
+TRACING = {
+    "equal_count": "rays of equal MSE",
+    "equal_seconds": "they take s",
+    "equal_time": "traced MSE at equal time / this",
+}
 matplotlib.use("Agg")
 
 
@@ -94,21 +100,23 @@ def table_of(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> s
 
 
 def beside_tracing(
-    network: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], count: str
-) -> str:
-    """What tracing needs for the network's 2D MSE, and has in its time, if known.
+    rows: Sequence[Mapping[str, Any]], count: str
+) -> list[Mapping[str, Any]]:
+    """Rows, with what tracing comes to beside each that is not traced: `TRACING`.
 
-    Traced rows are those with the key `count`.
+    Traced rows, two at least, are those with the key `count`.
     """
     traced = [(r[count], r["mse_2d"], r["seconds"]) for r in rows if count in r]
-    error, seconds = network["mse_2d"], network["seconds"]
-    if len(traced) < 2 or min(error, min(traced)[1]) <= 0:
-        return ""
-    equal, longer, ratio = equal_tracing(error, seconds, traced)
-    return f"""Tracing needs {equal:.3g} rays or paths a pixel for the network's 2D MSE,
-which take {longer:.2g} s; in the network's time it has {ratio:.2g} times that MSE.
+    if len(traced) < 2 or min(traced)[1] <= 0:
+        return list(rows)
 
-"""
+    def beside(row: Mapping[str, Any]) -> Mapping[str, Any]:
+        if count in row or "denoised" in row or row["mse_2d"] <= 0:
+            return row
+        found = equal_tracing(row["mse_2d"], row["seconds"], traced)
+        return {**row, **dict(zip(TRACING, found, strict=True))}
+
+    return [beside(row) for row in rows]
 
 
 def draw_curve(path: Path, losses: Float[np.ndarray, "S"], floor: float) -> None:

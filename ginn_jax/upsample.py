@@ -21,6 +21,8 @@ SHARPNESS = 8
 LEAST_WEIGHT = 0.05
 COARSEST = 4
 
+Ends = list[tuple[slice, float]]
+
 
 class Surface(NamedTuple):
     """What guides: position, unit normal and foreground mask of every pixel."""
@@ -75,9 +77,6 @@ def upsample(
             parts.append(_between(here, samples, lights, above, left, thickness))
     found, known = (_interleaved(p, step, shape) for p in zip(*parts, strict=True))
     return found.reshape(*shape, *values.shape[2:]), known[..., 0]
-
-
-Ends = list[tuple[slice, float]]
 
 
 def _around(place: int, start: int, step: int, size: int) -> Ends:

@@ -15,15 +15,18 @@ from benchmarks import (
     f2d,
     mc_conv,
     neighbors,
+    networks,
     poisson_radii,
     scaling,
     timing,
     train_step,
 )
-from ginn_jax import inference, presets
+from ginn_jax import inference, presets, scenes
 from ginn_jax.commandline import hasten
 from ginn_jax.disk_radius import with_disk_radius
 from ginn_jax.errors import InputError
+from ginn_jax.room import Room
+from ginn_jax.searches import uniform_limits
 
 
 def test_quick_keeps_what_the_user_gave():
@@ -151,6 +154,57 @@ def test_f2d(tmp_path, monkeypatch):
     }
     text = (tmp_path / "report.md").read_text()
     assert "straightforward / ours" in text
+
+
+def test_networks_at_equal_time(tmp_path, monkeypatch):
+    """As many steps as fit the time; a row for each, of the same unseen scenes."""
+    network = replace(tiny.ONE_LEVEL, lights=1, materials=1)
+    table = {"homogeneous": network, "linear": replace(network, splat=True)}
+    monkeypatch.setattr(networks, "ILLUMINATION", table)
+    monkeypatch.setattr(networks, "step_seconds", lambda *_: 0.5)
+    limits = uniform_limits(network, 1 << 15)
+    monkeypatch.setattr("ginn_jax.fit.training_room", lambda *_: Room(limits, limits))
+    monkeypatch.setattr(inference, "BLOCK", 128)
+    monkeypatch.setattr(scenes, "ProcessPoolExecutor", tiny.Here)
+    options = networks.Options(
+        tmp_path,
+        presets=tuple(table),
+        seconds=1.1,
+        shapes=2,
+        test_shapes=1,
+        points=1000,
+        paths=2,
+        resolution=32,
+        quick=True,
+    )
+    with tiny.cheap_compiling(), jax.numpy_dtype_promotion("standard"):
+        rows = networks.main(options)["rows"]
+    assert [row["preset"] for row in rows] == list(table)
+    for row in rows:
+        assert row["steps"] == 2
+        for name in ("shapes", "point lights"):
+            assert np.isfinite(row[f"relative, {name}"])
+    assert rows[0]["relative, shapes"] != rows[1]["relative, shapes"]
+    assert "homogeneous" in (tmp_path / "report.md").read_text()
+
+
+def test_step_is_timed_once_it_is_compiled_and_has_room(monkeypatch):
+    """A step that compiles, or that is repeated in more room, does not count."""
+    found = iter(["small", None, "large", "large", "large"])
+    ticks = iter(range(100))
+
+    def step(config, room, clouds, state):
+        used = next(found)
+        return state, 0.0, used, room
+
+    monkeypatch.setattr(networks, "PROBE", 2)
+    monkeypatch.setattr(networks.fit, "step_with_room", step)
+    monkeypatch.setattr(networks, "training_room", lambda *_: None)
+    monkeypatch.setattr(networks, "init_state", lambda *_: None)
+    monkeypatch.setattr(networks.time, "perf_counter", lambda: next(ticks) ** 2)
+    # The fourth and the fifth; begun at 4 and 6 (or so), over at 5 and 7.
+    assert networks.step_seconds(None, []) == ((4**2 - 3**2) + (6**2 - 5**2)) / 2
+    assert next(found, "none left") == "none left"
 
 
 def test_mc_conv_without_peers(tmp_path, monkeypatch):

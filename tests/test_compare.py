@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments import evaluate as experiment
-from ginn_jax import checkpoint, inference, scenes
+from ginn_jax import checkpoint, inference, report, scenes
 from ginn_jax.compare_networks import OURS, redrawn
 from ginn_jax.compare_report import (
     RIVALS,
@@ -72,6 +72,19 @@ def test_pooled_relative_error_is_a_ratio_of_means():
     [pooled] = pool_shots(shots)
     assert pooled["relative_mse_2d"] == pytest.approx(0.2)
     assert pooled["shots"] == 2
+
+
+def test_tracing_is_put_beside_what_is_not_traced():
+    """Rays for the same MSE and their time; MSE at equal time over one's own."""
+    mine = {"method": OURS, "mse_2d": 0.5, "seconds": 6.0}
+    traced = [{"rays": n, "mse_2d": 4 / n, "seconds": 1.0 + 2 * n} for n in (2, 1)]
+    others = [*traced, {"denoised": 1, "mse_2d": 0.1, "seconds": 9.0}]
+    first, *rest = report.beside_tracing([mine, *others], "rays")
+    added = {"equal_count": 8, "equal_seconds": 17, "equal_time": 4 / 2.5 / 0.5}
+    assert {name: first[name] for name in added} == pytest.approx(added)
+    assert mine.items() <= first.items()
+    assert rest == others
+    assert report.beside_tracing([mine, traced[0]], "rays") == [mine, traced[0]]
 
 
 def test_inset_lies_where_the_reference_varies():
@@ -181,7 +194,7 @@ def test_comparison_ends_in_a_report_and_keeps_its_references(tmp_path):
     traced = {r["method"]: r for r in first["error_against_time"] if "traced" in r}
     assert traced["4 rays"]["mse_2d"] < traced["1 rays"]["mse_2d"]
     text = (tmp_path / "out" / "report.md").read_text()
-    assert all(name in text for name in names)
+    assert all(name in text for name in (*names, "rays of equal MSE"))
     errors = {row["method"]: row["mse_2d"] for row in first["results"]}
     lost = [line for line in first["lost_cells"] if "mse_2d: screen space" in line]
     assert bool(lost) == (errors["screen space"] < errors[OURS])

@@ -100,4 +100,6 @@ def test_a_small_run_leaves_all_that_is_promised(tmp_path, monkeypatch):
     assert rays == sorted(rays, reverse=True)
     for name in ("learning_curve", "views", "error_against_time"):
         assert (tmp_path / f"{name}.png").stat().st_size > 1000
-    assert "unseen procedural shapes" in (tmp_path / "report.md").read_text()
+    text = (tmp_path / "report.md").read_text()
+    assert "unseen procedural shapes" in text
+    assert "rays of equal MSE" in text

@@ -60,6 +60,7 @@ def test_a_small_run_leaves_all_that_is_promised(effect, tmp_path, monkeypatch):
         assert (tmp_path / f"{name}.png").stat().st_size > 1000
     text = (tmp_path / "report.md").read_text()
     assert "unseen point lights" in text
+    assert "rays of equal MSE" in text
     assert ("denser half of the media" in text) == (effect == "sss")
     if effect == "gi":
         return
