@@ -1,4 +1,4 @@
-"""Networks trained for equal time on the same scenes: ours, linear in light, released.
+"""Networks trained for equal time on the same scenes: homogeneous, linear in light.
 
     python -m benchmarks.networks --effect gi
 
@@ -34,6 +34,7 @@ from ginn_jax.lit_experiment import (
 from ginn_jax.lit_scenes import Illumination, Scattering
 from ginn_jax.objects import Source
 from ginn_jax.presets import ILLUMINATION, SCATTERING
+from ginn_jax.process import forget_programs
 from ginn_jax.room import training_room
 from ginn_jax.train import Training, init_state
 
@@ -49,7 +50,7 @@ class Options:
     """Folder for clouds, runs, metrics.json and report.md."""
     effect: Literal["gi", "sss"] = "gi"
     """Global illumination or subsurface scattering."""
-    presets: tuple[Preset, ...] = ("homogeneous", "linear", "released")
+    presets: tuple[Preset, ...] = ("homogeneous", "linear")
     """The networks."""
     seconds: float = 240.0
     """Seconds of training for each."""
@@ -122,18 +123,33 @@ def compare(
     """Steps, errors and times of one network after its time of training."""
     config = experiment.training(run, network, run.points, len(clouds))
     steps = max(round(options.seconds / step_seconds(config, clouds)), 1)
+    forget_programs()
     config, run = replace(config, steps=steps), replace(run, steps=steps)
     done = experiment.train(console, config, clouds, run, {})
     variables = jax.device_put(done.state.variables, jax.devices()[0])
-    model, limits = Model(variables, jax.random.key(run.seed)), done.limits
-    found: dict[str, Any] = {"steps": steps, "seconds": done.seconds["train"]}
+    model = Model(variables, jax.random.key(run.seed))
+    made = {"steps": steps, "seconds": done.seconds["train"]}
+    given = network, done.limits, model, tests, settings
+    return made | errors_and_times(*given, run.resolution)
+
+
+def errors_and_times(
+    network: Network,
+    limits: Limits,
+    model: Model,
+    tests: Scenes,
+    settings: Illumination | Scattering,
+    size: int,
+) -> dict[str, Any]:
+    """Errors of every set of unseen scenes; times of an image of the first."""
+    found: dict[str, Any] = {}
     for name, (sources, some) in tests.items():
         called = [source.name for source in sources]
         given = network, limits, model, some, called, settings
         rows, limits = evaluate_light.evaluate_lit_clouds(*given)
         found[f"relative, {name}"] = pool_rows(rows)["relative_mse_3d"]
     sources, some = next(iter(tests.values()))
-    view = evaluate_light.lit_view(sources[0], settings, 2, run.resolution)
+    view = evaluate_light.lit_view(sources[0], settings, 2, size)
     cloud = split_points(some[0], count_given(len(some[0].position)))[0]
     row = evaluate_light.lit_network_row(network, limits, model, cloud, view)[0]
     parts = "seconds_3d", "seconds_2d"
