@@ -77,7 +77,7 @@ def equal_rays(error: float, per_ray_variance: float) -> float:
 
 
 def equal_tracing(
-    error: float, seconds: float, traced: Sequence[tuple[int, float, float]]
+    error: float, seconds: float, traced: Sequence[tuple[int | float, float, float]]
 ) -> tuple[float, float, float]:
     """What ray tracing comes to beside a method of this MSE and time.
 
