@@ -24,6 +24,7 @@ from ginn_jax import image, inference, lit_scenes, objects, reference, report
 from ginn_jax.architecture import Network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
+from ginn_jax.evaluate import at_scale
 from ginn_jax.limits import Limits
 from ginn_jax.mesh import find_meshes
 from ginn_jax.network import Variables
@@ -32,7 +33,6 @@ from ginn_jax.receptive_field import Oriented
 from ginn_jax.reference import GBuffer, Scene
 from ginn_jax.searches import uniform_limits
 from ginn_jax.train import Training, init_state
-from ginn_jax.upsample import shading_step
 
 UNSEEN_SEED = 20_000_000
 # The paper's AO, whole network, 1024 x 1024, NVIDIA GTX 1080.
@@ -140,9 +140,7 @@ def compare(
     if difference > 1e-4:
         raise AssertionError(f"results differ by {difference}")
     calls: dict[str, Callable[[], Any]] = {"ours": ours, "straightforward": plain}
-    calls |= {
-        f"ours, scale 1/{shading_step(s)}": partial(ours, s) for s in options.scales
-    }
+    calls |= {"ours" + at_scale(s): partial(ours, s) for s in options.scales}
     for rays in options.rays:
         calls[f"{rays} rays"] = partial(
             reference.ambient_occlusion,

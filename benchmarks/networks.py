@@ -3,8 +3,8 @@
     python -m benchmarks.networks --effect gi
 
 Of every preset a few steps are timed, then it trains anew with as many as fit the time,
-under its own schedule; capacities and compilation apart. Errors are of
-unseen shapes under unseen skies and of unseen shapes under point lights.
+under its own schedule; capacities and compilation apart. Errors are of unseen shapes
+under unseen skies and of unseen shapes under point lights.
 """
 
 import time
@@ -21,15 +21,16 @@ from benchmarks.timing import circumstances, describe
 from ginn_jax import evaluate_light, experiment, fit, report
 from ginn_jax.architecture import Network
 from ginn_jax.commandline import require_positive, start
-from ginn_jax.dataset import count_asked, count_given
+from ginn_jax.dataset import count_given
 from ginn_jax.evaluate import Model, pool_rows
 from ginn_jax.limits import Limits
 from ginn_jax.lit_clouds import LitCloud, split_points
 from ginn_jax.lit_experiment import (
-    VALIDATION_PATHS,
     LitOptions,
+    LitSettings,
     Preset,
     choose_sources,
+    with_exact_targets,
 )
 from ginn_jax.lit_scenes import Illumination, Scattering
 from ginn_jax.objects import Source
@@ -67,7 +68,7 @@ class Options:
     seed: int = 0
     """Seed of everything."""
     quick: bool = False
-    """Two steps or so on little data: to try things, not for numbers."""
+    """One step on little data: to try things, not for numbers."""
 
 
 QUICK = {"seconds": 1e-3, "shapes": 2, "test_shapes": 1, "points": 2000, "paths": 2}
@@ -85,11 +86,7 @@ def main(options: Options) -> dict[str, Any]:
     experiment.check_run(run, {"paths": 2})
     lit = Illumination if options.effect == "gi" else Scattering
     settings = lit(points=options.points, paths=options.paths)
-    exact = replace(
-        settings,
-        paths=max(options.paths, 16 if options.quick else VALIDATION_PATHS),
-        targets=count_asked(options.points),
-    )
+    exact = with_exact_targets(settings, options.quick)
     seen, unseen = choose_sources(run)
     folder = options.out / "data"
     clouds = experiment.make(console, "training", seen, settings, folder / "training")
@@ -118,7 +115,7 @@ def compare(
     network: Network,
     clouds: list[LitCloud],
     tests: Scenes,
-    settings: Illumination | Scattering,
+    settings: LitSettings,
 ) -> dict[str, Any]:
     """Steps, errors and times of one network after its time of training."""
     config = experiment.training(run, network, run.points, len(clouds))
@@ -138,7 +135,7 @@ def errors_and_times(
     limits: Limits,
     model: Model,
     tests: Scenes,
-    settings: Illumination | Scattering,
+    settings: LitSettings,
     size: int,
 ) -> dict[str, Any]:
     """Errors of every set of unseen scenes; times of an image of the first."""

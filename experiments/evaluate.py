@@ -34,7 +34,7 @@ from ginn_jax.compare_networks import (
 from ginn_jax.compare_screen import screen_pictures
 from ginn_jax.compare_tracing import denoised_picture, traced_picture, with_reference
 from ginn_jax.dataset import count_given
-from ginn_jax.evaluate import Row
+from ginn_jax.evaluate import Row, at_scale
 from ginn_jax.experiment import make
 from ginn_jax.objects import Source
 from ginn_jax.scenes import Settings, cloud_origin
@@ -178,14 +178,9 @@ def compare_scene(
             front += [p.row for p in pictures]
             own = next(p for p in pictures if p.row["method"] == OURS)
             front += rivals(options, settings, shot, given, own, networks, units)
-            rates = OURS, *(at_scale(scale) for scale in options.scales)
+            rates = {OURS + at_scale(scale) for scale in (1.0, *options.scales)}
             front += [codes_kept(row) for row in front if row["method"] in rates]
     return rows, front, shown, networks
-
-
-def at_scale(scale: float) -> str:
-    """What our network is called where it shades fewer pixels."""
-    return f"{OURS}, scale 1/{shading_step(scale)}"
 
 
 def rivals(
@@ -200,7 +195,7 @@ def rivals(
     """Our network at other rates and radii, and tracing, plain and denoised."""
     trained, rows = networks[OURS], []
     for scale in options.scales:
-        called = at_scale(scale), networks[OURS]
+        called = OURS + at_scale(scale), networks[OURS]
         picture, networks[OURS] = network_picture(*called, given, shot, scale)
         rows.append(picture.row)
     for times in options.disks:

@@ -33,6 +33,7 @@ from ginn_jax.reference import (
     build_scene,
     render_gbuffer,
 )
+from ginn_jax.upsample import shading_step
 
 Row = dict[str, Any]
 Image = Float[np.ndarray, "H W *C"]
@@ -195,7 +196,7 @@ def timed_network(
 
 def at_scale(scale: float) -> str:
     """What the name of a method says of a resolution scale."""
-    return f", scale {scale:g}" if scale < 1 else ""
+    return f", scale 1/{shading_step(scale)}" if scale < 1 else ""
 
 
 def network_row(

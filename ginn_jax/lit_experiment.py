@@ -47,6 +47,7 @@ from ginn_jax.train import Training
 
 VALIDATION_PATHS = 512
 PATH_COUNTS = (1, 4, 16, 64)
+LitSettings = Illumination | Scattering
 Preset = Literal["homogeneous", "linear", "released", "only_2d", "only_3d"]
 
 
@@ -78,7 +79,7 @@ QUICK = {
 
 def run_experiment(
     options: LitOptions,
-    settings: Illumination | Scattering,
+    settings: LitSettings,
     network: Network,
     title: str,
 ) -> dict[str, Any]:
@@ -90,9 +91,7 @@ def run_experiment(
         settings = replace(settings, points=PAPER_SPLIT.points, paths=PAPER_SPLIT.paths)
     folder = options.out / "data"
     clouds = make(console, "training clouds", seen, settings, folder / "training")
-    paths = max(settings.paths, VALIDATION_PATHS)
-    exact = replace(settings, paths=paths, targets=count_asked(settings.points))
-    exact = exact if not options.quick else replace(exact, paths=16)
+    exact = with_exact_targets(settings, options.quick)
     tests = {
         name: make(console, f"unseen, {name}", sources, exact, folder / name)
         for name, sources in unseen.items()
@@ -116,6 +115,12 @@ def run_experiment(
         f" {metrics['seconds_total'] / 60:.1f} minutes: {options.out / 'report.md'}"
     )
     return metrics
+
+
+def with_exact_targets(settings: LitSettings, quick: bool) -> LitSettings:
+    """The same with targets to measure by, at the points where networks are asked."""
+    paths = 16 if quick else max(settings.paths, VALIDATION_PATHS)
+    return replace(settings, paths=paths, targets=count_asked(settings.points))
 
 
 def choose_sources(
@@ -165,7 +170,7 @@ def evaluation(
     options: LitOptions,
     run: fit.Fit,
     config: Training,
-    settings: Illumination | Scattering,
+    settings: LitSettings,
     unseen: dict[str, list[Source]],
     clouds: dict[str, list[LitCloud]],
 ) -> dict[str, Any]:
@@ -193,7 +198,7 @@ def image_evaluation(
     config: Training,
     limits: Any,
     model: Model,
-    settings: Illumination | Scattering,
+    settings: LitSettings,
     shown: Sequence[tuple[Source, LitCloud]],
 ) -> dict[str, Any]:
     """Images of unseen objects, and error against run time on the same pixels."""
