@@ -54,8 +54,9 @@ def whole(
     built, demands = geometry.build_geometry(
         network, limits, cloud, key=jax.random.key(KEY)
     )
+    order = np.arange(cloud.mask.shape[0])
     code, scale = shading.encode_channels(
-        network, variables, built, built.finest, cloud.mask, material, light
+        network, variables, built, order, cloud.mask, material, light
     )
     encoded = shading.Encoded(built.levels[0], built.grid, built.area, code, scale)
     values, more = shading.shade(network, limits, variables, encoded, queries)

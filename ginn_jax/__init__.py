@@ -41,6 +41,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     presets           the tables: ours, the paper's, the authors', ablations
     limits            capacities of all searches, and what they needed
     searches          which searches a network makes, and their capacities' names
+    facets            normals and light as means over the samples around
     geometry          levels, edges and weights of a cloud; demands
     network           f_3D and f_2D
     example           what a training step computes before any parameter enters

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from ginn_jax.checks import one_of, positive, whole
+from ginn_jax.checks import number, one_of, positive, whole
 from ginn_jax.errors import InputError
 
 QUERY = -1
@@ -65,6 +65,8 @@ class Network:
                 maps alone, scaled by features: what an area sends on is a sum over it
     asks        what f_2D sees of a query: its "normal", or "all" its attributes
     splat       whether points are shaded, and their shading only blended at queries
+    smooth      radius within which normals and light of finest points and queries are
+                means over the samples around, see `facets`; 0: they are their own
     """
 
     levels: tuple[float, ...]
@@ -85,6 +87,7 @@ class Network:
     beams: int = 0
     asks: Literal["normal", "all"] = "normal"
     splat: bool = False
+    smooth: float = 0.0
 
     def __post_init__(self) -> None:
         """Raise `InputError` for what is no network, wherever it was read."""
@@ -98,6 +101,7 @@ class Network:
             whole(name, getattr(self, name), least, WIDEST)
         for name in ("materials", "lights", "beams"):
             whole(name, getattr(self, name), 0, WIDEST)
+        number("smooth", self.smooth, 0.0)
         one_of("density", self.density, ("kde", "surface"))
         one_of("norm", self.norm, ("batch", "layer", "none"))
         one_of("asks", self.asks, ("normal", "all"))

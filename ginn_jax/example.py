@@ -19,6 +19,7 @@ from ginn_jax.dataset import (
     side_by_side,
     unit_light,
 )
+from ginn_jax.facets import facet_means, smooth_queries
 from ginn_jax.geometry import Geometry, build_geometry, build_query_field
 from ginn_jax.limits import Demands, Limits
 from ginn_jax.receptive_field import Field, Oriented
@@ -70,12 +71,14 @@ def thin_and_search(
     geometry, demands = build_geometry(network, limits, oriented(cloud), key=disk_key)
     rows, real = left_over(geometry, mask, clouds * queries)
     asking = Oriented(cloud.position[rows], cloud.normal[rows], real)
+    asking, facets, near = smooth_queries(network, limits, geometry.around, asking)
     finest, grid, area = geometry.levels[0], geometry.grid, geometry.area
     field, more = build_query_field(network, limits, finest, grid, area, asking)
-    given = points_asked(finest, *numbers(cloud, geometry.finest, finest.mask))
-    asked = queries_asked(network, asking, *numbers(cloud, rows, real))
+    own = numbers(cloud, geometry.finest, finest.mask, geometry.facets)
+    given = points_asked(finest, *own)
+    asked = queries_asked(network, asking, *numbers(cloud, rows, real, facets))
     example = Example(geometry, given, field, asking, asked, cloud.target[rows])
-    return example, demands | more
+    return example, demands | near | more
 
 
 def in_unit_light(cloud: ShadedPoints) -> ShadedPoints:
@@ -87,14 +90,20 @@ def in_unit_light(cloud: ShadedPoints) -> ShadedPoints:
 
 
 def numbers(
-    cloud: ShadedPoints, rows: Int[Array, "M"], mask: Bool[Array, "M"]
+    cloud: ShadedPoints,
+    rows: Int[Array, "M"],
+    mask: Bool[Array, "M"],
+    facets: Field | None = None,
 ) -> tuple[Array | None, Array | None]:
-    """Material and light of some rows, zero where masked."""
-
-    def take(a: Array | None) -> Array | None:
-        return None if a is None else jnp.where(mask[:, None], a[rows], 0.0)
-
-    return take(cloud.material), take(cloud.light)
+    """Material and light of some rows, zero where masked; the light as the mean over
+    the samples around, if `facets` are given."""
+    material, light = (
+        None if a is None else jnp.where(mask[:, None], a[rows], 0.0)
+        for a in (cloud.material, cloud.light)
+    )
+    if facets is not None and light is not None and cloud.light is not None:
+        light = facet_means(facets, cloud.light, light)
+    return material, light
 
 
 def points_asked(

@@ -9,13 +9,14 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, Key
+from jaxtyping import Array, Float, Int, Key
 
 from ginn_jax.architecture import Conv, Network
-from ginn_jax.candidates import DENSE_PACKET, PACKET
+from ginn_jax.candidates import PACKET
+from ginn_jax.facets import Around, facet_field, smooth_normals
 from ginn_jax.hierarchy import Level, LevelLimit, build_level, draw_lots, same_side
 from ginn_jax.limits import Demands, Limits
-from ginn_jax.packets import Demand, EdgeLimit, Edges, radius_edges
+from ginn_jax.packets import Demand, EdgeLimit, Edges
 from ginn_jax.receptive_field import (
     Field,
     Oriented,
@@ -24,7 +25,7 @@ from ginn_jax.receptive_field import (
     point_area,
     surface_weight,
 )
-from ginn_jax.searches import area_search, needs_areas, transposed
+from ginn_jax.searches import area_search, needs_areas, search, transposed
 from ginn_jax.voxels import VoxelGrid, build_grid
 
 
@@ -35,6 +36,8 @@ class Geometry(NamedTuple):
     fields  the receptive field of each convolution of f_3D
     area    the area each finest point stands for, where senders are so weighted
     grid    the finest level, ready for f_2D's search
+    facets  the samples around each finest point, where facets are smoothed
+    around  the cloud, ready to be searched for those around queries
     """
 
     levels: tuple[Oriented, ...]
@@ -42,21 +45,8 @@ class Geometry(NamedTuple):
     fields: dict[str, Field]
     area: Array | None
     grid: VoxelGrid
-
-
-def search(
-    conv: Conv,
-    limits: Limits,
-    grid: VoxelGrid,
-    receivers: Oriented,
-    packet: int = PACKET,
-) -> tuple[Edges, Demands]:
-    """Edges of one convolution and their demands; `grid` holds the senders."""
-    names = [f"{conv.name}.{part}" for part in Demand._fields]
-    limit = EdgeLimit(*(limits.of(name) for name in names))
-    ends = grid, receivers.position, receivers.mask, jnp.float32(conv.radius)
-    edges = radius_edges(*ends, limit, packet=packet)
-    return edges, dict(zip(names, edges.demand, strict=True))
+    facets: Field | None = None
+    around: Around | None = None
 
 
 def turn_edges(edges: Edges, senders: int, receivers: int) -> Edges:
@@ -114,6 +104,12 @@ def build_geometry(
     if names is None:
         names = jnp.arange(cloud.mask.shape[0], dtype=jnp.int32)
     levels, grids, rows, demands = _build_levels(network, limits, cloud, names, key)
+    facets, around = None, None
+    if network.smooth:
+        around = Around(cloud, grid_of(network, grids, -1, cloud))
+        facets, more = facet_field(network, limits, around, levels[0])
+        levels = _with_normals(levels, smooth_normals(facets, around, levels[0]), rows)
+        demands |= more
     finest = levels[0]
     found: dict[str, Edges] = {}
     for conv in reversed(network.encoder):
@@ -140,7 +136,8 @@ def build_geometry(
         )
         demands |= more
     grid = grid_of(network, grids, 0, finest)
-    return Geometry(levels, rows, fields, areas.get(0), grid), demands
+    made = Geometry(levels, rows[0], fields, areas.get(0), grid, facets, around)
+    return made, demands
 
 
 def grid_of(
@@ -165,10 +162,10 @@ def _build_levels(
 ) -> tuple[
     tuple[Oriented, ...],
     dict[int, VoxelGrid],
-    Int[Array, "K"],
+    list[Int[Array, "_"]],
     Demands,
 ]:
-    """The Poisson disk hierarchy of a cloud, and which points make its finest level."""
+    """The Poisson disk hierarchy of a cloud, and each level's rows one level finer."""
     grids: dict[int, VoxelGrid] = {}
     levels: list[Level] = []
     demands: Demands = {}
@@ -190,7 +187,20 @@ def _build_levels(
         levels.append(level)
         points = Oriented(level.position, level.normal, level.mask)
     ends = tuple(Oriented(lv.position, lv.normal, lv.mask) for lv in levels)
-    return ends, grids, levels[0].index, demands
+    return ends, grids, [level.index for level in levels], demands
+
+
+def _with_normals(
+    levels: Sequence[Oriented],
+    normal: Float[Array, "N 3"],
+    rows: Sequence[Int[Array, "_"]],
+) -> tuple[Oriented, ...]:
+    """The levels with these normals of the finest one; `rows` as of `_build_levels`."""
+    turned = [levels[0]._replace(normal=normal)]
+    for level, index in zip(levels[1:], rows[1:], strict=True):
+        found = jnp.where(level.mask[:, None], turned[-1].normal[index], 0.0)
+        turned.append(level._replace(normal=found))
+    return tuple(turned)
 
 
 def _level_areas(
@@ -220,13 +230,9 @@ def build_query_field(
     grid: VoxelGrid,
     area: Array | None,
     queries: Oriented,
-    dense: bool = False,
+    packet: int = PACKET,
 ) -> tuple[Field, Demands]:
-    """The field of f_2D: from the finest level, its grid and areas, to the queries.
-
-    `dense` queries, pixels in coherent order, are searched for in larger packets.
-    """
-    packet = DENSE_PACKET if dense else PACKET
+    """The field of f_2D: from the finest level, its grid and areas, to the queries."""
     edges, demands = search(network.query, limits, grid, queries, packet)
     field, more = receptive_field(
         network, network.query, limits, finest, queries, edges, area

@@ -32,16 +32,15 @@ from ginn_jax.receptive_field import Oriented
 from ginn_jax.searches import uniform_limits
 from ginn_jax.shading import (
     Encoded,
+    Searched,
     cloud_demands,
     encode,
     numbers_asked,
     query_demands,
     shade,
 )
-from ginn_jax.voxels import VoxelGrid
 
 BLOCK = 1 << 15
-
 
 encode_whole = jax.jit(encode, static_argnums=(0, 1))
 shade_block = jax.jit(
@@ -104,18 +103,15 @@ def cloud_limits(network: Network, cloud: Oriented, *, key: Key[Array, ""]) -> L
 
 def query_limits(
     network: Network,
-    finest: tuple[Oriented, VoxelGrid, Array | None],
+    searched: Searched,
     blocks: Sequence[Oriented],
     coherent: bool = False,
 ) -> Limits:
-    """Limits that hold what f_2D of each block needs, measured with ample ones.
-
-    `finest` are the finest points of the cloud, their grid and their areas.
-    """
+    """Limits that hold what f_2D of each block needs, measured with ample ones."""
     ample = uniform_limits(network, 16 * blocks[0].mask.shape[0])
 
     def probe(limits: Limits, number: int) -> Demands:
-        given = network, limits, finest, blocks[number]
+        given = network, limits, searched, blocks[number]
         return jax.device_get(_query_demands(*given, coherent=coherent))
 
     return measure_limits(only(ample, network.query.name), probe, len(blocks), SLACK)
@@ -126,9 +122,8 @@ def check_numbers(name: str, numbers: Any, width: int, rows: int) -> None:
     if width == 0 and numbers is not None:
         raise InputError(f"the network takes no {name}: leave it out")
     given = real_array(name, () if numbers is None else numbers)
-    shape = given.shape
-    if width and (len(shape) != 3 or shape[1:] != (rows, width)):
-        raise InputError(f"{name} is {shape}, the network takes [C {rows} {width}]")
+    if width and (given.ndim != 3 or given.shape[1:] != (rows, width)):
+        raise InputError(f"{name} is {given.shape}, the network takes [C {rows} {width}]")
     if width and not np.isfinite(given).all():
         raise InputError(f"{name} holds non-finite numbers: remove those points")
 
@@ -186,8 +181,7 @@ def in_blocks(
     """Points counted from `center`, so many at a time; the last block is padded."""
     rows = -(-len(position) // size) * size
     points = pad_points(center, position, normal, rows)
-    starts = range(0, rows, size)
-    return [Oriented(*(a[i : i + size] for a in points)) for i in starts]
+    return [Oriented(*(a[i : i + size] for a in points)) for i in range(0, rows, size)]
 
 
 def _shade_blocks(
@@ -245,8 +239,7 @@ def shade_points(
     numbers = tuple(pad_channels(a, len(blocks) * size) for a in asked)
     ends = network, variables, encoded, blocks, numbers, coherent
     attempt = partial(_shade_blocks, *ends)
-    finest = encoded.points, encoded.grid, encoded.area
-    measure = partial(query_limits, network, finest, blocks, coherent)
+    measure = partial(query_limits, network, encoded.searched(), blocks, coherent)
     parts, sufficed, demands = with_room(limits, attempt, measure)
     if 2 * size > largest_block(encoded.scale is not None):  # the next may be larger
         sufficed = fitted(sufficed, demands)

@@ -76,12 +76,13 @@ def apply_stored(
 
 
 def weighted_sum(
-    weights: Float[Array, "C E"],
+    weights: Float[Array, "#C E"],
     features: Float[Array, "N C"],
     field: Field,
     receivers: int,
 ) -> Float[Array, "M C"]:
-    """Sum over the edges of every receiver, each feature weighted in its own way."""
+    """Sum over the edges of every receiver, each feature by weights of its own or all
+    by the same."""
     given = field._replace(inputs=weights)
     return _convolve(_weighted, receivers, features.shape[1], None, features, given)
 
@@ -91,7 +92,7 @@ def _weighted(
     kernel: None,
     outputs: int,
     features: Float[Array, "T C"],
-    inputs: Float[Array, "C T"],
+    inputs: Float[Array, "#C T"],
     weight: Float[Array, "T"],
 ) -> Float[Array, "T C"]:
     # Turned once for all colours; in the product every one of them would turn it.

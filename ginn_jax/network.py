@@ -170,8 +170,8 @@ def splat(values: Float[Array, "N"], field: Field, receivers: int) -> Float[Arra
     if field.inputs.shape[0] > 3:
         near *= jnp.maximum(field.inputs[5], 0.0) ** 4 + LEAST_LIKENESS
     both = jnp.stack([values, jnp.ones_like(values)], axis=1)
-    share = jnp.broadcast_to(near * field.weight, (2, near.size))
-    total, weight = weighted_sum(share, both, field, receivers).T
+    share = near * field.weight
+    total, weight = weighted_sum(share[None], both, field, receivers).T
     return jnp.where(weight > 0, total / jnp.where(weight > 0, weight, 1.0), 0.0)
 
 

@@ -139,7 +139,7 @@ _DIFFUSE = compact_network(levels=(0.02, 0.05, 0.1, 0.2), materials=1, **_FAR)
 
 # Most media are dense: light leaves them near to where it entered.
 _DENSE = compact_network(
-    levels=(0.015, 0.04, 0.1, 0.2), query_radius=0.0275, sided=True, **_FAR
+    levels=(0.015, 0.04, 0.1, 0.2), query_radius=0.0275, sided=True, smooth=0.01, **_FAR
 )
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from ginn_jax.architecture import Network
 from ginn_jax.checks import unit_rows
 from ginn_jax.dataset import center_of
-from ginn_jax.geometry import Geometry, build_geometry, build_query_field
+from ginn_jax.geometry import Geometry, build_geometry
 from ginn_jax.inference import (
     block_size,
     cloud_limits,
@@ -31,26 +31,30 @@ from ginn_jax.mcconv import stored_kernel
 from ginn_jax.neighbors import bucket
 from ginn_jax.network import STORED, Code, Variables
 from ginn_jax.process import ALONE
-from ginn_jax.receptive_field import Field, Oriented, in_coherent_order
-from ginn_jax.shading import encode_channels, shade_channels
+from ginn_jax.receptive_field import Oriented, in_coherent_order
+from ginn_jax.shading import (
+    Asking,
+    Searched,
+    encode_channels,
+    search_queries,
+    shade_channels,
+)
 
 
 class ScenePlan(NamedTuple):
-    """f_3D for any light: geometry, kernel values, and the cloud's rows of level 0."""
+    """f_3D for any light: geometry, kernel values, and how the cloud was sorted."""
 
     geometry: Geometry
     stored: dict[str, Any]
-    rows: Int[Array, "K"]
+    order: Int[Array, "N"]
     mask: Bool[Array, "N"]
 
 
 class QueryPlan(NamedTuple):
-    """f_2D of one block of queries for any light; `order` is how they were sorted."""
+    """f_2D of one block of queries for any light: geometry and kernel values."""
 
-    field: Field
+    asking: Asking
     stored: dict[str, Any]
-    queries: Oriented
-    order: Int[Array, "M"]
 
 
 class Relightable(NamedTuple):
@@ -76,25 +80,24 @@ def plan_scene(
         name: {"kernel": stored_kernel(weights[name]["kernel"], field)}
         for name, field in geometry.fields.items()
     }
-    return ScenePlan(geometry, stored, order[geometry.finest], mask), demands
+    return ScenePlan(geometry, stored, order, mask), demands
 
 
 def plan_queries(
     network: Network,
     limits: Limits,
     variables: Variables,
-    geometry: Geometry,
+    searched: Searched,
     queries: Oriented,
 ) -> tuple[QueryPlan, Demands]:
     """All of f_2D, for one block of queries, that does not depend on the light."""
     queries, order = in_coherent_order(queries)
-    ends = geometry.levels[0], geometry.grid, geometry.area
-    field, demands = build_query_field(network, limits, *ends, queries)
+    asking, demands = search_queries(network, limits, searched, queries, order)
     name, weights = network.query.name, variables["shader"]["params"]
     stored = {}
     if not network.splat:
-        stored[name] = {"kernel": stored_kernel(weights[name]["kernel"], field)}
-    return QueryPlan(field, stored, queries, order), demands
+        stored[name] = {"kernel": stored_kernel(weights[name]["kernel"], asking.field)}
+    return QueryPlan(asking, stored), demands
 
 
 def encode_planned(
@@ -103,13 +106,13 @@ def encode_planned(
     plan: ScenePlan,
     material: Float[Array, "C N A"],
     light: Float[Array, "C N L"],
-) -> tuple[Code, Float[Array, "C"]]:
-    """f_3D of a light, and its unit."""
+) -> tuple[Code, Float[Array, "C"], Float[Array, "C N L"] | None]:
+    """f_3D of a light, its unit and, where facets are smoothed, all of it in order."""
     ready = {"encoder": variables["encoder"] | {STORED: plan.stored}}
-    ends = plan.geometry, plan.rows, plan.mask
+    ends = plan.geometry, plan.order, plan.mask
     code, scale = encode_channels(network, ready, *ends, material, light)
     assert scale is not None
-    return code, scale
+    return code, scale, light[:, plan.order] if plan.geometry.around else None
 
 
 def shade_planned(
@@ -118,13 +121,14 @@ def shade_planned(
     plan: QueryPlan,
     code: Code,
     scale: Float[Array, "C"],
+    around: Float[Array, "C N L"] | None,
     material: Float[Array, "C M A"] | None,
     light: Float[Array, "C M L"] | None,
 ) -> Float[Array, "C M"]:
     """f_2D of a light at one block of queries."""
     ready = {"shader": variables["shader"] | {STORED: plan.stored}}
-    ends = plan.field, plan.queries, plan.order
-    return shade_channels(network, ready, *ends, code, scale, material, light)
+    lit = code, scale, around
+    return shade_channels(network, ready, plan.asking, *lit, material, light)
 
 
 _plan_scene = jax.jit(plan_scene, static_argnums=(0, 1))
@@ -162,19 +166,20 @@ def prepare_relighting(
     measure = partial(cloud_limits, network, points, key=key)
     scene, sufficed = in_fitting_room(limits, plan_points, measure)
 
+    geometry = scene.geometry
+    searched = geometry.levels[0], geometry.grid, geometry.area, geometry.around
+
     def plan_blocks(limits: Limits) -> tuple[list[QueryPlan], list[Demands]]:
         flat = only(limits, network.query.name)
         plans, demands = [], []
         for number, block in enumerate(blocks):
-            ends = scene.geometry, block
-            plan, demand = _plan_queries(network, flat, variables, *ends)
+            plan, demand = _plan_queries(network, flat, variables, searched, block)
             device = jax.devices()[number % len(jax.devices())]
             plans.append(jax.device_put(plan, device))
             demands.append(demand)
         return plans, demands
 
-    finest = scene.geometry.levels[0], scene.geometry.grid, scene.geometry.area
-    measure = partial(query_limits, network, finest, blocks)
+    measure = partial(query_limits, network, searched, blocks)
     plans, sufficed = in_fitting_room(sufficed, plan_blocks, measure)
     say_raised(limits, sufficed)
     return Relightable(scene, tuple(plans)), sufficed

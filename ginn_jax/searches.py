@@ -1,8 +1,28 @@
 """Which searches a network makes, and the names of their capacities."""
 
-from ginn_jax.architecture import Conv, Network
-from ginn_jax.limits import Limits
-from ginn_jax.packets import Demand
+import jax.numpy as jnp
+
+from ginn_jax.architecture import QUERY, Conv, Network
+from ginn_jax.candidates import PACKET
+from ginn_jax.limits import Demands, Limits
+from ginn_jax.packets import Demand, EdgeLimit, Edges, radius_edges
+from ginn_jax.receptive_field import Oriented
+from ginn_jax.voxels import VoxelGrid
+
+
+def search(
+    conv: Conv,
+    limits: Limits,
+    grid: VoxelGrid,
+    receivers: Oriented,
+    packet: int = PACKET,
+) -> tuple[Edges, Demands]:
+    """Edges of one convolution and their demands; `grid` holds the senders."""
+    names = [f"{conv.name}.{part}" for part in Demand._fields]
+    limit = EdgeLimit(*(limits.of(name) for name in names))
+    ends = grid, receivers.position, receivers.mask, jnp.float32(conv.radius)
+    edges = radius_edges(*ends, limit, packet=packet)
+    return edges, dict(zip(names, edges.demand, strict=True))
 
 
 def limit_names(network: Network) -> tuple[str, ...]:
@@ -12,8 +32,9 @@ def limit_names(network: Network) -> tuple[str, ...]:
         for i in range(len(network.levels))
         for part in (*Demand._fields, "points")
     ]
-    if needs_areas(network):
-        names += [f"{area_search(network).name}.{part}" for part in Demand._fields]
+    more = [area_search(network)] if needs_areas(network) else []
+    for conv in (*more, *facet_searches(network)):
+        names += [f"{conv.name}.{part}" for part in Demand._fields]
     for conv in (*network.encoder, network.query):
         if conv is not network.query and transposed(network, conv):
             continue
@@ -31,6 +52,17 @@ def needs_areas(network: Network) -> bool:
 def area_search(network: Network) -> Conv:
     """The search that tells it then, as wide as a convolution's would be."""
     return Conv("area", 0, 0, 2.5 * network.levels[0], 0.25, 1)
+
+
+def facet_searches(network: Network) -> tuple[Conv, ...]:
+    """The searches for the samples around finest points and around queries, if any.
+
+    The latter is f_2D's, by the beginning of its name.
+    """
+    if not network.smooth:
+        return ()
+    ends = (0, "facets"), (QUERY, f"{network.query.name}.facets")
+    return tuple(Conv(name, 0, end, network.smooth, 0.25, 1) for end, name in ends)
 
 
 def uniform_limits(network: Network, size: int) -> Limits:

@@ -11,13 +11,27 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ginn_jax.architecture import Network
+from ginn_jax.candidates import DENSE_PACKET, PACKET
 from ginn_jax.dataset import safe_inverse, unit_light
 from ginn_jax.example import points_asked, queries_asked
+from ginn_jax.facets import Around, smooth_light, smooth_queries
 from ginn_jax.geometry import Geometry, build_geometry, build_query_field
 from ginn_jax.limits import Demands, Limits
 from ginn_jax.network import Code, Encoder, Shader, Variables
 from ginn_jax.receptive_field import Field, Oriented, in_coherent_order
 from ginn_jax.voxels import VoxelGrid
+
+# The finest level, its grid and the areas of its points; the samples around queries.
+Searched = tuple[Oriented, VoxelGrid, Array | None, Around | None]
+
+
+class Asking(NamedTuple):
+    """Queries with their fields; `order` are the rows they came from, if sorted."""
+
+    queries: Oriented
+    order: Int[Array, "M"] | None
+    field: Field
+    facets: Field | None
 
 
 class Encoded(NamedTuple):
@@ -25,6 +39,7 @@ class Encoded(NamedTuple):
 
     Where there is light, `code` has a leading axis of channels and `scale` is the mean
     light of each channel; else `scale` is None. `points` are relative to `center`.
+    Where facets are smoothed, `around` are the samples that the queries' are means of.
     """
 
     points: Oriented
@@ -33,6 +48,13 @@ class Encoded(NamedTuple):
     code: Code
     scale: Float[Array, "C"] | None
     center: Float[Any, "3"] | None = None
+    around: Around | None = None
+
+    def searched(self) -> Searched:
+        """What the searches of f_2D look into."""
+        around = self.around
+        around = around and around._replace(light=None)
+        return self.points, self.grid, self.area, around
 
 
 def encode(
@@ -48,12 +70,14 @@ def encode(
     mask = cloud.mask
     cloud, order = in_coherent_order(cloud)
     geometry, demands = build_geometry(network, limits, cloud, order, key=key)
-    rows = order[geometry.finest]
     code, scale = encode_channels(
-        network, variables, geometry, rows, mask, material, light
+        network, variables, geometry, order, mask, material, light
     )
+    around = geometry.around
+    if around is not None and light is not None:
+        around = around._replace(light=light[:, order])
     ends = geometry.levels[0], geometry.grid, geometry.area
-    return Encoded(*ends, code, scale), demands
+    return Encoded(*ends, code, scale, around=around), demands
 
 
 def cloud_demands(
@@ -68,24 +92,34 @@ def encode_channels(
     network: Network,
     variables: Variables,
     geometry: Geometry,
-    rows: Int[Array, "K"],
+    order: Int[Array, "N"],
     mask: Bool[Array, "N"],
     material: Float[Array, "C N A"] | None,
     light: Float[Array, "C N L"] | None,
 ) -> tuple[Code, Float[Array, "C"] | None]:
-    """f_3D of every channel, and its unit of light; `rows` of the cloud are level 0."""
-    finest = geometry.levels[0]
+    """f_3D of every channel, and its unit of light.
 
-    def channel(material: Array | None, light: Array | None) -> tuple[Code, Any]:
+    `order` are the rows of the cloud, whose `mask` says which are real, in the order of
+    the geometry.
+    """
+    finest, rows = geometry.levels[0], order[geometry.finest]
+    smoothed = take_rows(light, rows)
+    if geometry.facets is not None and light is not None:
+        smoothed = smooth_light(geometry.facets, light[:, order], light[:, rows])
+
+    def channel(
+        material: Array | None, light: Array | None, smoothed: Array | None
+    ) -> tuple[Code, Any]:
         scale = None
-        if light is not None:
-            light, scale = unit_light(light, mask)
-        given = points_asked(finest, *take_rows((material, light), rows, finest.mask))
+        if light is not None and smoothed is not None:
+            _, scale = unit_light(light, mask)
+            smoothed = smoothed * safe_inverse(scale)
+        given = points_asked(finest, *real_rows((material, smoothed), finest.mask))
         encoder = Encoder(network, train=False)
         code: Any = encoder.apply(variables["encoder"], *given, geometry)
         return code, scale
 
-    return per_channel(channel, material, light)
+    return per_channel(channel, take_rows(material, rows), light, smoothed)
 
 
 def shade(
@@ -106,46 +140,70 @@ def shade(
     order = None
     if not coherent:
         queries, order = in_coherent_order(queries)
-    finest = encoded.points, encoded.grid, encoded.area
-    given = network, limits, *finest, queries
-    field, demands = build_query_field(*given, dense=coherent)
+    ends = encoded.searched(), queries
+    asking, demands = search_queries(network, limits, *ends, order, coherent)
     lit = encoded.code, encoded.scale
-    numbers = material, light
-    values = shade_channels(network, variables, field, queries, order, *lit, *numbers)
-    return values, demands
+    around = None if encoded.around is None else encoded.around.light
+    given = network, variables, asking, *lit, around
+    return shade_channels(*given, material, light), demands
+
+
+def search_queries(
+    network: Network,
+    limits: Limits,
+    searched: Searched,
+    queries: Oriented,
+    order: Int[Array, "M"] | None = None,
+    dense: bool = False,
+) -> tuple[Asking, Demands]:
+    """All of f_2D's geometry; `order`: the rows that sorted queries came from.
+
+    `dense` queries, pixels in coherent order, are searched for in larger packets.
+    """
+    packet = DENSE_PACKET if dense else PACKET
+    points, grid, area, around = searched
+    queries, facets, more = smooth_queries(network, limits, around, queries, packet)
+    given = network, limits, points, grid, area, queries
+    field, demands = build_query_field(*given, packet)
+    return Asking(queries, order, field, facets), demands | more
 
 
 def query_demands(
     network: Network,
     limits: Limits,
-    finest: tuple[Oriented, VoxelGrid, Array | None],
+    searched: Searched,
     queries: Oriented,
     coherent: bool = False,
 ) -> Demands:
     """What `shade` needs of every capacity, without f_2D itself."""
     queries = queries if coherent else in_coherent_order(queries)[0]
-    return build_query_field(network, limits, *finest, queries, dense=coherent)[1]
+    return search_queries(network, limits, searched, queries, dense=coherent)[1]
 
 
 def shade_channels(
     network: Network,
     variables: Variables,
-    field: Field,
-    queries: Oriented,
-    order: Int[Array, "M"] | None,
+    asking: Asking,
     code: Code,
     scale: Float[Array, "C"] | None,
+    around: Float[Array, "C N L"] | None,
     material: Float[Array, "C M A"] | None,
     light: Float[Array, "C M L"] | None,
 ) -> Float[Array, "*C M"]:
-    """f_2D of every channel; `order`: the rows that sorted queries came from."""
+    """f_2D of every channel; `around` is the light of the samples around."""
+    queries, order, field, facets = asking
+    material, light = (
+        take_rows(a, order) for a in numbers_asked(network, material, light)
+    )
+    if facets is not None and around is not None and light is not None:
+        light = smooth_light(facets, around, light)
 
     def channel(
         code: Code, scale: Array | None, material: Array | None, light: Array | None
     ) -> Float[Array, "M"]:
         if light is not None and scale is not None:
             light = light * safe_inverse(scale)
-        numbers = take_rows((material, light), order, queries.mask)
+        numbers = real_rows((material, light), queries.mask)
         asked = queries_asked(network, queries, *numbers)
         shader = Shader(network, train=False)
         values: Any = shader.apply(
@@ -155,7 +213,6 @@ def shade_channels(
             values = jnp.zeros_like(values).at[order].set(values)
         return values if scale is None else values * scale
 
-    material, light = numbers_asked(network, material, light)
     return per_channel(channel, code, scale, material, light)
 
 
@@ -173,10 +230,16 @@ def per_channel(function: Any, *arrays: Any) -> Any:
 
 
 def take_rows(
-    columns: tuple[Array | None, Array | None],
-    rows: Int[Array, "M"] | None,
-    mask: Bool[Array, "M"],
+    numbers: Float[Array, "C N A"] | None, rows: Int[Array, "M"] | None
+) -> Float[Array, "C M A"] | None:
+    """Rows of what there is, or all in their order."""
+    return numbers if numbers is None or rows is None else numbers[:, rows]
+
+
+def real_rows(
+    columns: tuple[Array | None, Array | None], mask: Bool[Array, "M"]
 ) -> tuple[Array | None, ...]:
-    """Rows of what there is, or all in their order, zero where masked."""
-    taken = (a if a is None or rows is None else a[rows] for a in columns)
-    return tuple(None if a is None else jnp.where(mask[:, None], a, 0.0) for a in taken)
+    """What there is, zero where masked."""
+    return tuple(
+        None if a is None else jnp.where(mask[:, None], a, 0.0) for a in columns
+    )

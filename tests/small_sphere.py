@@ -55,7 +55,7 @@ def demands_of(config, limits, stages, cloud, queries):
 
 def generous(config):
     names = se.limit_names(config)
-    return lm.Limits(tuple((n, GENEROUS[n.split(".")[1]]) for n in names))
+    return lm.Limits(tuple((n, GENEROUS[n.split(".")[-1]]) for n in names))
 
 
 def as_numpy(tree):

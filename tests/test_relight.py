@@ -22,6 +22,7 @@ EFFECTS = {
     "illumination": replace(tiny.ONE_LEVEL, linear=True, materials=1, lights=1),
     "homogeneous": replace(tiny.ONE_LEVEL, materials=1, lights=1),
     "beams": replace(LOCAL, beams=2),
+    "smooth": replace(LOCAL, linear=True, local=False, smooth=0.1),
     "only_2d": only_2d(LOCAL),
     "only_3d": only_3d(
         replace(tiny.NETWORK, materials=3, lights=1, asks="all", local=True, beams=2)
