@@ -122,8 +122,9 @@ def check_numbers(name: str, numbers: Any, width: int, rows: int) -> None:
     if width == 0 and numbers is not None:
         raise InputError(f"the network takes no {name}: leave it out")
     given = real_array(name, () if numbers is None else numbers)
-    if width and (given.ndim != 3 or given.shape[1:] != (rows, width)):
-        raise InputError(f"{name} is {given.shape}, the network takes [C {rows} {width}]")
+    shape = given.shape
+    if width and (len(shape) != 3 or shape[1:] != (rows, width)):
+        raise InputError(f"{name} is {shape}, the network takes [C {rows} {width}]")
     if width and not np.isfinite(given).all():
         raise InputError(f"{name} holds non-finite numbers: remove those points")
 
@@ -136,8 +137,7 @@ def pad_points(
 ) -> Oriented:
     """Points counted from `center`, and padding up to `rows`."""
     place, mask = pad_rows(relative_to(center, position), rows)
-    turned, _ = pad_rows(np.asarray(normal, np.float32), rows)
-    return Oriented(place, turned, mask)
+    return Oriented(place, pad_rows(np.asarray(normal, np.float32), rows)[0], mask)
 
 
 def pad_channels(
