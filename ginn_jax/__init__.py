@@ -25,6 +25,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     slab              albedo of a thick slab of a medium, and its inverse
     subsurface        radiant exitance by random walks in a medium
     objects           which objects and lights there are, and which go together
+    ranges            ranges of rows expanded to lists, tile by tile
     voxels            points sorted by voxel, found by binary search under jit
     candidates        points that packets of queries may be near
     packets           radius search by packets of queries under jit

@@ -9,19 +9,14 @@ reaches, as an image's pixels do: fewer lists, hardly longer ones.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ginn_jax.voxels import (
-    VoxelGrid,
-    cell_of,
-    expand_ranges,
-    narrow_runs,
-    prefix_sum,
-    saturating_sum,
-)
+from ginn_jax.ranges import Slots, fill, range_slots, saturating_sum
+from ginn_jax.voxels import VoxelGrid, cell_of, narrow_runs
 
 PACKET, DENSE_PACKET = 32, 128
 WORD = 32
@@ -88,20 +83,32 @@ def packet_candidates(
     candidates: int,
 ) -> tuple[Candidates, Int[Array, ""]]:
     """Points in the columns and layers that each packet reaches; how many in all."""
-    area = under.shape[:, 0] * under.shape[:, 1]
-    slots, _ = expand_ranges(jnp.zeros_like(area), area, columns)
-    packet = slots.owner
+    slots = range_slots(under.shape[:, 0] * under.shape[:, 1], columns)
+    start, length = fill(partial(_column_run, grid, under, slots), slots.total, columns)
+    runs = range_slots(length, candidates, slots.total)
+    # The columns of a packet lie side by side, and so do their candidates.
+    first = jnp.append(runs.begin, runs.total)[jnp.minimum(slots.begin, columns)]
+    shift = start - runs.begin
+    row = fill(lambda k: k + shift[runs.owner[k]], runs.total, candidates)
+    count = jnp.diff(first, append=runs.total)
+    return Candidates(row, first, count), runs.total
+
+
+def _column_run(
+    grid: VoxelGrid, under: Columns, slots: Slots, slot: Int[Array, "T"]
+) -> tuple[Int[Array, "T"], Int[Array, "T"]]:
+    """First row and number of the points that packets reach in one column each."""
+    packet = slots.owner[slot]
+    row = slot - slots.begin[packet]
     deep = jnp.maximum(under.shape[packet, 1], 1)
-    x, y = under.first[packet].T + jnp.stack([slots.row // deep, slots.row % deep])
-    column = jnp.where(slots.valid, x * grid.shape[1] + y, 0)
+    x, y = under.first[packet].T + jnp.stack([row // deep, row % deep])
+    real = slot < slots.total
+    column = jnp.where(real, x * grid.shape[1] + y, 0)
     first = grid.column_start[column]
-    last = jnp.where(slots.valid, grid.column_start[column + 1], first)
+    last = jnp.where(real, grid.column_start[column + 1], first)
     floor, top = (cell_of(grid, e[packet, 2], 2) for e in (under.low, under.high))
     start, stop = narrow_runs(grid.layer, first, last, floor, top + 1)
-    count = jnp.zeros(area.size, jnp.int32)
-    count = count.at[packet].add(stop - start, indices_are_sorted=True)
-    found, total = expand_ranges(start, stop - start, candidates)
-    return Candidates(found.row, prefix_sum(count) - count, count), total
+    return start, stop - start
 
 
 def count_words(near: Candidates) -> Int[Array, ""]:

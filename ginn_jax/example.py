@@ -22,8 +22,9 @@ from ginn_jax.dataset import (
 from ginn_jax.facets import facet_means, smooth_queries
 from ginn_jax.geometry import Geometry, build_geometry, build_query_field
 from ginn_jax.limits import Demands, Limits
+from ginn_jax.ranges import compact
 from ginn_jax.receptive_field import Field, Oriented
-from ginn_jax.voxels import compact, morton_order
+from ginn_jax.voxels import morton_order
 
 
 class Asked(NamedTuple):

@@ -10,7 +10,8 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from ginn_jax.neighbors import bucket, find_neighbors
 from ginn_jax.packets import Demand, EdgeLimit, Edges, radius_edges
-from ginn_jax.voxels import VoxelGrid, compact
+from ginn_jax.ranges import compact
+from ginn_jax.voxels import VoxelGrid
 
 WAITING, DROPPED, KEPT = 1, 0, 2
 

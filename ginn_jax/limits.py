@@ -23,7 +23,7 @@ Demands = dict[str, Int[Any, ""]]
 Made = TypeVar("Made")
 # What is made room for beyond what was needed.
 SLACK = 1.25
-# Calls in room for more than so many times that take a third longer and more.
+# Calls in room for more than so many times that take a tenth longer and more.
 LOOSE = 2.0
 # So many probes take less time than compiling them for tighter limits does; what they
 # needed at the most, times so much, is seldom exceeded by others.

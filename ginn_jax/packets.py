@@ -22,7 +22,8 @@ from ginn_jax.candidates import (
     packet_candidates,
     packet_columns,
 )
-from ginn_jax.voxels import Expansion, VoxelGrid, expand_ranges, prefix_sum
+from ginn_jax.ranges import Slots, fill, prefix_sum, range_slots
+from ginn_jax.voxels import VoxelGrid
 
 # Words that are computed at a time.
 TILE = 1 << 14
@@ -63,14 +64,15 @@ class Edges(NamedTuple):
 
 
 class Words(NamedTuple):
-    """Bit b of `word[l, q]`: query `query[l, q]` is near the list's candidate b.
+    """Bit b of `word[l, q]`: query `query[slots.owner[l], q]` is near candidate b of l.
 
-    One list is 32 candidates of one packet of Q queries. `order` are the rows of the
-    flat words by query, and under a query by list; padding comes last.
+    One list is 32 candidates, from `first` on, of one packet of Q queries. `order` are
+    the rows of the flat words by query, and under a query by list; padding comes last.
     """
 
     word: UInt32[Array, "L Q"]
-    query: Int[Array, "L Q"]
+    query: Int[Array, "P Q"]
+    slots: Slots
     first: Int[Array, "L"]
     order: Int[Array, "W"]
 
@@ -121,18 +123,19 @@ def packet_words(
     `number` are the queries' own numbers, a permutation, if they are not in order.
     """
     lists = -(-near.count // WORD)
-    chunk, total = expand_ranges(jnp.zeros_like(lists), lists, capacity)
+    slots = range_slots(lists, capacity)
     packet = query.shape[0] // lists.shape[0]
-    first = near.start[chunk.owner] + WORD * chunk.row
-    left = jnp.where(chunk.valid, near.count[chunk.owner] - WORD * chunk.row, 0)
     point, bit = grid.position.T, jnp.arange(WORD, dtype=jnp.int32)
     lane = jnp.where(mask, query.T, jnp.nan).reshape(3, -1, packet)
 
-    def test(*lists: Int[Array, "T"]) -> UInt32[Array, "T Q"]:
-        owner, first, left = lists
+    def test(chunk: Int[Array, "T"]) -> tuple[UInt32[Array, "T Q"], Int[Array, "T"]]:
+        owner = slots.owner[chunk]
+        skipped = WORD * (chunk - slots.begin[owner])
+        first, left = near.start[owner] + skipped, near.count[owner] - skipped
         place = first[:, None] + bit
         row = near.row[jnp.minimum(place, near.row.size - 1)]
         real = (bit < left[:, None]) & (place < near.row.size)
+        real &= (chunk < slots.total)[:, None]
         hit = jnp.float32(0)
         for axis in range(3):
             place = jnp.where(real, point[axis][row], jnp.nan)
@@ -144,68 +147,56 @@ def packet_words(
         # A sum, so that XLA does not compute a word anew for each edge that looks.
         flags = jnp.uint32(1) << bit.astype(jnp.uint32)
         word = jnp.where(hit, flags, jnp.uint32(0))
-        return jnp.sum(word, axis=-1, dtype=jnp.uint32)
+        return jnp.sum(word, axis=-1, dtype=jnp.uint32), first
 
-    word = _in_tiles(test, (chunk.owner, first, left), total, packet)
+    word, first = fill(test, slots.total, capacity, TILE // packet)
     if number is None:
-        order = _order_in_packets(chunk, lists, packet)
+        order = _order_in_packets(slots, lists, packet)
         number = jnp.arange(query.shape[0], dtype=jnp.int32)
     else:
-        order = _order_by_number(chunk, lists, number, packet)
-    return Words(word, number.reshape(-1, packet)[chunk.owner], first, order)
-
-
-def _in_tiles(
-    test: Callable[..., UInt32[Array, "T Q"]],
-    lists: tuple[Int[Array, "L"], ...],
-    count: Int[Array, ""],
-    packet: int,
-) -> UInt32[Array, "L Q"]:
-    """`test` of the first `count` lists, on CPU in tiles that fit a core's cache."""
-    rows = lists[0].shape[0]
-    size = min(TILE // packet, rows) if jax.default_backend() == "cpu" else rows
-
-    def fill(tile: Int[Array, ""], word: UInt32[Array, "L Q"]) -> Array:
-        start = jnp.minimum(tile * size, rows - size)
-        some = [jax.lax.dynamic_slice_in_dim(a, start, size) for a in lists]
-        return jax.lax.dynamic_update_slice_in_dim(word, test(*some), start, axis=0)
-
-    nothing = jnp.zeros((rows, packet), jnp.uint32)
-    tiles = (jnp.minimum(count, rows) + size - 1) // size
-    return jax.lax.fori_loop(0, tiles, fill, nothing)
+        order = _order_by_number(slots, lists, number, packet)
+    return Words(word, number.reshape(-1, packet), slots, first, order)
 
 
 def _order_in_packets(
-    chunk: Expansion, lists: Int[Array, "P"], packet: int
+    slots: Slots, lists: Int[Array, "P"], packet: int
 ) -> Int[Array, "W"]:
     """Rows of the words with those of a query side by side, so that its edges will be.
 
     The words of a packet lie [list, query] and are wanted [query, list].
     """
-    capacity = chunk.owner.shape[0]
-    begin = prefix_sum(lists) - lists
-    width = jnp.clip(capacity - begin, 1, jnp.maximum(lists, 1))
-    begin, width = (a[chunk.owner][:, None] for a in (begin, width))
-    place = jnp.arange(capacity * packet, dtype=jnp.int32).reshape(-1, packet)
-    inside = place - begin * packet
-    # Integer division is slow; what rounding spoils is put right.
-    query = (inside.astype(jnp.float32) / width.astype(jnp.float32)).astype(jnp.int32)
-    query -= (query * width > inside).astype(jnp.int32)
-    query += ((query + 1) * width <= inside).astype(jnp.int32)
-    order = (begin + inside - query * width) * packet + query
-    return jnp.where(chunk.valid[:, None], order, place).reshape(-1)
+    capacity = slots.owner.shape[0]
+    width = jnp.clip(capacity - slots.begin, 1, jnp.maximum(lists, 1))
+    lane = jnp.arange(packet, dtype=jnp.int32)
+
+    def rows(chunk: Int[Array, "T"]) -> Int[Array, "T Q"]:
+        owner = slots.owner[chunk]
+        first, across = (a[owner][:, None] for a in (slots.begin, width))
+        place = chunk[:, None] * packet + lane
+        inside = place - first * packet
+        # Integer division is slow; what rounding spoils is put right.
+        query = inside.astype(jnp.float32) / across.astype(jnp.float32)
+        query = query.astype(jnp.int32)
+        query -= (query * across > inside).astype(jnp.int32)
+        query += ((query + 1) * across <= inside).astype(jnp.int32)
+        order = (first + inside - query * across) * packet + query
+        return jnp.where((chunk < slots.total)[:, None], order, place)
+
+    return fill(rows, slots.total, capacity, TILE // packet).reshape(-1)
 
 
 def _order_by_number(
-    chunk: Expansion, lists: Int[Array, "P"], number: Int[Array, "M"], packet: int
+    slots: Slots, lists: Int[Array, "P"], number: Int[Array, "M"], packet: int
 ) -> Int[Array, "W"]:
     """The same where queries are numbered otherwise than they lie."""
-    rows = chunk.owner.shape[0] * packet
+    chunk = jnp.arange(slots.owner.shape[0], dtype=jnp.int32)
+    rows = chunk.size * packet
     query_lists = jnp.repeat(lists, packet)
     begin = jnp.zeros_like(query_lists).at[number].set(query_lists)
     begin = (prefix_sum(begin) - begin)[number]
-    place = begin.reshape(-1, packet)[chunk.owner] + chunk.row[:, None]
-    place = jnp.where(chunk.valid[:, None], place, rows).reshape(-1)
+    own = chunk - slots.begin[slots.owner]
+    place = begin.reshape(-1, packet)[slots.owner] + own[:, None]
+    place = jnp.where((chunk < slots.total)[:, None], place, rows).reshape(-1)
     order = jnp.full(rows, rows - 1, jnp.int32)
     return order.at[place].set(jnp.arange(rows, dtype=jnp.int32), mode="drop")
 
@@ -214,13 +205,25 @@ def list_bits(
     words: Words, near: Candidates, capacity: int
 ) -> tuple[tuple[Int[Array, "E"], Int[Array, "E"], Bool[Array, "E"]], Int[Array, ""]]:
     """What `near.row` says, query and validity of each set bit; how many there are."""
-    flat = words.word.reshape(-1)
-    hits = jax.lax.population_count(flat[words.order]).astype(jnp.int32)
-    slots, total = expand_ranges(jnp.zeros_like(hits), hits, capacity)
-    place = words.order[slots.owner]
-    bit = select_bit(flat[place], slots.row)
-    row = jnp.where(slots.valid, words.first[place // words.word.shape[1]] + bit, 0)
-    return (near.row[row], words.query.reshape(-1)[place], slots.valid), total
+    flat, packet = words.word.reshape(-1), words.word.shape[1]
+    count = jnp.minimum(words.slots.total, words.word.shape[0]) * packet
+    hits = fill(
+        lambda k: jax.lax.population_count(flat[words.order[k]]).astype(jnp.int32),
+        count,
+        flat.size,
+    )
+    slots = range_slots(hits, capacity, count)
+    query = words.query[words.slots.owner].reshape(-1)
+
+    def pick(slot: Int[Array, "T"]) -> tuple[Int[Array, "T"], Int[Array, "T"]]:
+        rank = slots.owner[slot]
+        place = words.order[rank]
+        bit = select_bit(flat[place], slot - slots.begin[rank])
+        row = words.first[place // packet] + bit
+        return near.row[jnp.where(slot < slots.total, row, 0)], query[place]
+
+    valid = jnp.arange(capacity, dtype=jnp.int32) < slots.total
+    return (*fill(pick, slots.total, capacity), valid), slots.total
 
 
 def select_bit(word: UInt32[Array, "*E"], rank: Int[Array, "*E"]) -> Int[Array, "*E"]:

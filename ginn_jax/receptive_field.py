@@ -20,7 +20,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ginn_jax.packets import Edges
-from ginn_jax.voxels import expand_ranges, morton_order
+from ginn_jax.ranges import expand_ranges
+from ginn_jax.voxels import morton_order
 
 TILE = 8192
 

@@ -1,9 +1,8 @@
-"""Points in a voxel grid of fixed tables, and ranges of rows expanded to lists.
+"""Points in a voxel grid of fixed tables.
 
 Points are sorted by column (a cell across x and y) and in a column by layer along z, so
 the points of a box are one contiguous run of rows in each column under it, found by
-binary search: no bucket that could overflow, no hash collision. Lists of variable
-length are made by prefix sums, in a capacity that the caller chose.
+binary search: no bucket that could overflow, no hash collision.
 """
 
 from typing import NamedTuple
@@ -11,6 +10,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
+
+from ginn_jax.ranges import prefix_sum
 
 # Columns: at most as many as points, but for few points.
 TABLE, FEWEST = (1 << 16) - 1, 1 << 12
@@ -32,32 +33,6 @@ class VoxelGrid(NamedTuple):
     origin: Float[Array, "3"]
     cell: Float[Array, "3"]
     shape: Int[Array, "3"]
-
-
-def prefix_sum(counts: Int[Array, "K"]) -> Int[Array, "K"]:
-    """Inclusive prefix sum of small non-negative counts."""
-    return jax.lax.platform_dependent(
-        counts,
-        cpu=_running_sum,
-        default=lambda counts: jnp.cumsum(counts, dtype=jnp.int32),
-    )
-
-
-def _running_sum(counts: Int[Array, "K"]) -> Int[Array, "K"]:
-    """One sum after the other: on CPU five times as fast as XLA's tree.
-
-    Unrolled by 16 or more XLA splits the loop's body, which is fifty times as slow.
-    """
-    return jax.lax.scan(
-        lambda total, n: (total + n,) * 2, jnp.int32(0), counts, unroll=4
-    )[1]
-
-
-def saturating_sum(counts: Int[Array, "..."]) -> Int[Array, ""]:
-    """Sum of counts that stops at the largest int32 instead of wrapping around."""
-    wraps = jnp.sum(counts, dtype=jnp.float32) > 2.0**31 - 1024
-    total = jnp.sum(counts, dtype=jnp.int32)
-    return jnp.where(wraps, jnp.int32(2**31 - 1), total)
 
 
 def build_grid(
@@ -181,42 +156,3 @@ def narrow_runs(
 
     start, _, stop, _ = jax.lax.fori_loop(0, steps, halve, (first, last, first, last))
     return start, stop
-
-
-class Expansion(NamedTuple):
-    """Slots of all ranges one after the other: range, its row, and whether real."""
-
-    owner: Int[Array, "K"]
-    row: Int[Array, "K"]
-    valid: Bool[Array, "K"]
-
-
-def expand_ranges(
-    start: Int[Array, "R"], length: Int[Array, "R"], capacity: int
-) -> tuple[Expansion, Int[Array, ""]]:
-    """List rows start .. start + length of every range, and how many there are in all.
-
-    Slots that are not valid still name some range.
-    """
-    stop = prefix_sum(length)
-    begin = stop - length
-    total = saturating_sum(length)
-    opened = jnp.zeros(capacity, jnp.int32).at[begin].add(1, mode="drop")
-    owner = prefix_sum(opened) - 1
-    number = jnp.arange(capacity, dtype=jnp.int32)
-    return Expansion(owner, number + (start - begin)[owner], number < total), total
-
-
-def compact(
-    keep: Bool[Array, "K"], capacity: int
-) -> tuple[Int[Array, "E"], Bool[Array, "E"], Int[Array, ""]]:
-    """Indices of the True entries in order, which of them are real, and the demand."""
-    rank = prefix_sum(keep.astype(jnp.int32))
-    slot = jnp.where(keep, rank - 1, capacity)
-    index = (
-        jnp.zeros(capacity, jnp.int32)
-        .at[slot]
-        .set(jnp.arange(keep.size, dtype=jnp.int32), mode="drop", unique_indices=True)
-    )
-    total = rank[-1] if keep.size else jnp.int32(0)
-    return index, jnp.arange(capacity, dtype=jnp.int32) < total, total

@@ -1,54 +1,13 @@
-"""What grids are made of: ranges, compaction, Morton codes and stable orders."""
+"""What grids are made of: Morton codes and stable orders."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from ginn_jax import voxels as vx
-
-INT32_MAX = 2**31 - 1
-
-
-@pytest.mark.parametrize("total", [INT32_MAX - 5000, 2**31, 2**31 + 5, 2**32 + 7])
-def test_demand_saturates_where_int32_would_wrap(total):
-    length = np.full(9, total // 9, np.int64)
-    length[0] += total - length.sum()
-    length = jnp.asarray(length.astype(np.int32))
-    demand = vx.expand_ranges(jnp.zeros(9, jnp.int32), length, 64)[1]
-    assert int(demand) == min(total, INT32_MAX)
-
-
-expand = jax.jit(vx.expand_ranges, static_argnames="capacity")
-squeeze = jax.jit(vx.compact, static_argnames="capacity")
-
-
-@given(st.lists(st.integers(0, 6), min_size=8, max_size=8))
-def test_ranges_are_listed_in_order(lengths):
-    starts = 100 * np.arange(len(lengths), dtype=np.int32)
-    rows = [
-        (i, s + k)
-        for i, (s, n) in enumerate(zip(starts, lengths, strict=True))
-        for k in range(n)
-    ]
-    slots, total = jax.tree.map(
-        np.asarray, expand(starts, np.array(lengths, np.int32), 16)
-    )
-    wanted = rows[:16]
-    listed = np.stack([slots.owner, slots.row], axis=1)[slots.valid]
-    assert total == len(rows)
-    assert listed.tolist() == [list(row) for row in wanted]
-
-
-@given(hnp.arrays(bool, 20), st.sampled_from([1, 7, 24]))
-def test_compaction_keeps_order_and_counts_all(keep, capacity):
-    index, real, demand = map(np.asarray, squeeze(keep, capacity))
-    assert demand == keep.sum()
-    assert index[real].tolist() == np.flatnonzero(keep)[:capacity].tolist()
-
 
 order_of = jax.jit(vx.morton_order)
 
