@@ -92,15 +92,15 @@ def range_slots(
 ) -> Slots:
     """Slots for ranges that long, the first `ranges` of them or all."""
     count, size = length.shape[0], tile_rows(length.shape[0])
-    ranges = jnp.int32(count) if ranges is None else jnp.minimum(ranges, count)
-    length = jnp.where(jnp.arange(count, dtype=jnp.int32) < ranges, length, 0)
+    listed = jnp.minimum(count if ranges is None else ranges, jnp.int32(count))
+    length = jnp.where(jnp.arange(count, dtype=jnp.int32) < listed, length, 0)
     padded = jnp.pad(length, (0, -count % max(size, 1)))
 
     def open_slots(tile: Int[Array, ""], state: tuple[Array, ...]) -> tuple[Array, ...]:
         begin, opened, used = state
         some = jax.lax.dynamic_slice_in_dim(padded, tile * size, size)
         stop = used + prefix_sum(some)
-        real = tile * size + jnp.arange(size, dtype=jnp.int32) < ranges
+        real = tile * size + jnp.arange(size, dtype=jnp.int32) < listed
         place = jnp.where(real, stop - some, capacity)
         begin = jax.lax.dynamic_update_slice_in_dim(
             begin, stop - some, tile * size, axis=0
@@ -108,7 +108,7 @@ def range_slots(
         return begin, opened.at[place].add(1, mode="drop"), stop[-1]
 
     nothing = jnp.zeros_like(padded), jnp.zeros(capacity, jnp.int32), jnp.int32(0)
-    tiles = (ranges + size - 1) // max(size, 1)
+    tiles = (listed + size - 1) // max(size, 1)
     begin, opened, _ = jax.lax.fori_loop(0, tiles, open_slots, nothing)
     total = saturating_sum(length)
     return Slots(_sum_tiles(opened, total) - 1, begin[:count], total)
