@@ -110,6 +110,13 @@ def row_of(effect: str, method: str, measured: dict[str, Any]) -> dict[str, Any]
     return {key: value for key, value in row.items() if value is not None}
 
 
+def processors(measured: dict[str, str]) -> str:
+    """What each effect was measured on, once where all were on the same."""
+    if len(names := set(measured.values())) == 1:
+        return names.pop()
+    return ", ".join(f"{e.upper()} on {name}" for e, name in measured.items())
+
+
 def write_report(m: dict[str, Any]) -> str:
     """report.md: results, timing, lost cells."""
     heads = {"effect": "effect", "method": "method", "mse_3d": "3D MSE"}
@@ -124,7 +131,7 @@ def write_report(m: dict[str, Any]) -> str:
     sizes = ", ".join(f"{e.upper()} {n}" for e, n in m["resolution"].items())
     return f"""# The paper's tables next to ours
 
-Ours: {next(iter(m["processor"].values()))}, images of {sizes} pixels a side; the
+Ours: {processors(m["processor"])}, images of {sizes} pixels a side; the
 paper's: 1024 pixels a side on a GTX 1080. Scenes and units of errors differ, so only
 ratios within a table compare ("over SS": over screen space of the same table). Reports
 of the single effects say how ours were measured.

@@ -8,7 +8,7 @@ from benchmarks import paper_tables
 from ginn_jax.errors import InputError
 
 
-def measured(folder, effect, worse):
+def measured(folder, effect, worse, processor="a processor"):
     """An evaluation whose methods have errors in steps."""
     rows = [
         {"method": m, "mse_2d": worse / (i + 1), "dssim_2d": 0.1 * (i + 1)}
@@ -19,7 +19,7 @@ def measured(folder, effect, worse):
         "results": rows,
         "lost_cells": ["dssim_2d: screen space 0.1, ours 0.4"],
         "options": {"resolution": "64"},
-        "environment": {"processor": "a processor"},
+        "environment": {"processor": processor},
     }
     place = folder / f"evaluate_{effect}"
     place.mkdir()
@@ -45,3 +45,17 @@ def test_ratios_are_over_screen_space_of_the_same_effect(tmp_path):
 def test_a_missing_evaluation_is_named_with_the_command(tmp_path):
     with pytest.raises(InputError, match=r"experiments\.evaluate --effect ao"):
         paper_tables.main(paper_tables.Options(tmp_path, tmp_path / "out"))
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        ("a processor", "Ours: a processor, images"),
+        ("another", "Ours: AO on a processor, GI on another, SSS on another, images"),
+    ],
+)
+def test_every_processor_is_named(tmp_path, other, said):
+    for effect in paper_tables.EFFECTS:
+        measured(tmp_path, effect, 1, "a processor" if effect == "ao" else other)
+    paper_tables.main(paper_tables.Options(tmp_path, tmp_path / "out"))
+    assert said in (tmp_path / "out" / "report.md").read_text()
