@@ -79,7 +79,8 @@ def saturating_sum(counts: Int[Array, "..."]) -> Int[Array, ""]:
 class Slots(NamedTuple):
     """Slots of all ranges one after the other: whose they are, which are real.
 
-    Slots that are not real still name some range. `begin` are the ranges' first slots.
+    Slots that are not real still name some range. `begin` are the ranges' first slots,
+    the end of all for those that are not listed.
     """
 
     owner: Int[Array, "K"]
@@ -93,7 +94,8 @@ def range_slots(
     """Slots for ranges that long, the first `ranges` of them or all."""
     count, size = length.shape[0], tile_rows(length.shape[0])
     listed = jnp.minimum(count if ranges is None else ranges, jnp.int32(count))
-    length = jnp.where(jnp.arange(count, dtype=jnp.int32) < listed, length, 0)
+    is_listed = jnp.arange(count, dtype=jnp.int32) < listed
+    length = jnp.where(is_listed, length, 0)
     padded = jnp.pad(length, (0, -count % max(size, 1)))
 
     def open_slots(tile: Int[Array, ""], state: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -111,7 +113,9 @@ def range_slots(
     tiles = (listed + size - 1) // max(size, 1)
     begin, opened, _ = jax.lax.fori_loop(0, tiles, open_slots, nothing)
     total = saturating_sum(length)
-    return Slots(_sum_tiles(opened, total) - 1, begin[:count], total)
+    # Tiles that are not taken leave zeros, but what is not listed begins at the end.
+    begin = jnp.where(is_listed, begin[:count], total)
+    return Slots(_sum_tiles(opened, total) - 1, begin, total)
 
 
 def _sum_tiles(counts: Int[Array, "K"], count: Int[Array, ""]) -> Int[Array, "K"]:
