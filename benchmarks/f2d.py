@@ -20,7 +20,7 @@ import numpy as np
 
 from benchmarks.straightforward import shade_plainly
 from benchmarks.timing import Timing, circumstances, describe, measure
-from ginn_jax import image, inference, lit_scenes, objects, reference, report
+from ginn_jax import blocks, image, inference, lit_scenes, objects, reference, report
 from ginn_jax.architecture import Network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
@@ -165,7 +165,7 @@ def block_memory(
     network: Network, limits: Limits, variables: Variables, encoded: image.Encoded
 ) -> int:
     """Scratch memory of one block of f_2D, the same for every image, in bytes."""
-    rows = inference.BLOCK
+    rows = blocks.BLOCK
     zeros = np.zeros((rows, 3), np.float32)
     queries = Oriented(zeros, zeros, np.ones(rows, bool))
     flat = inference.only(limits, network.query.name)

@@ -19,13 +19,8 @@ from ginn_jax import compare, compare_report, report, sequences
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
 from ginn_jax.compare import Stage
-from ginn_jax.compare_networks import (
-    OURS,
-    Trained,
-    load_networks,
-    mean_values,
-    network_values,
-)
+from ginn_jax.compare_frames import Playing, shade_next, start_playing
+from ginn_jax.compare_networks import OURS, load_networks
 from ginn_jax.compare_screen import screen_pictures
 from ginn_jax.compare_tracing import trace
 from ginn_jax.dataset import ShadedPoints
@@ -79,6 +74,7 @@ class Options:
     """A few small frames: to try things, not for numbers."""
 
 
+ANEW = f"{OURS}, frame by frame"
 QUICK = {"frames": 2, "resolution": 48, "reference": 8, "points": 3000, "looks": 32}
 QUICK |= {"draws": 2}
 
@@ -94,9 +90,15 @@ def main(options: Options) -> dict[str, Any]:
     light = choose_light(options)
     key = jax.random.key(options.seed)
     runs = options.checkpoint, options.only_2d, options.only_3d
-    networks = load_networks(options.effect, settings, runs, key=key)
+    loaded = load_networks(options.effect, settings, runs, key=key)
     given = meshes[0], settings.points, options.effect != "sss"
     carried = sequences.carried_samples(*given, seed=options.seed)
+    networks = {
+        name: start_playing(
+            trained, options.draws if name == OURS else 1, settings.points
+        )
+        for name, trained in loaded.items()
+    }
     frames: dict[str, list[np.ndarray]] = {}
     with bar(console) as progress:
         task = progress.add_task("frames", total=len(meshes), note="")
@@ -139,10 +141,10 @@ def shade_frame(
     mesh: Mesh,
     light: Light,
     carried: sequences.Carried,
-    networks: dict[str, Trained],
+    networks: dict[str, Playing],
     *,
     seed: int,
-) -> tuple[dict[str, np.ndarray], dict[str, Trained]]:
+) -> tuple[dict[str, np.ndarray], dict[str, Playing]]:
     """All methods' images of a frame, the reference, its variance and the mask."""
     samples, size = sequences.samples_at(mesh, carried), options.resolution
     camera = orbit_camera(width=size, height=size)
@@ -154,14 +156,18 @@ def shade_frame(
         compare.with_truth(shot, truth), camera, settings, units
     ):
         values[picture.row["method"]] = picture.values
-    for name, trained in networks.items():
-        values[name], networks[name] = network_values(trained, given, shot)
-    ours = values[OURS], networks[OURS]
-    name, mean = mean_values(*ours, given, shot, options.draws)
-    values[name] = mean
+    after = {}
+    for name, playing in networks.items():
+        (own, *others), after[name] = shade_next(playing, given, shot)
+        values[name] = own
+        if others:
+            mean = f"{name}, mean of {options.draws}"
+            values[mean] = np.mean([own, *others], axis=0)
+    anew = start_playing(after[OURS].draws[0], 1, settings.points)
+    (values[ANEW],), _ = shade_next(anew, given, shot)
     mask = shot.gbuffer.mask
     images = {n: fill(mask, np.asarray(v)) for n, v in values.items()}
-    return images | {"mask": mask, "albedo": compare.albedo_of(shot)}, networks
+    return images | {"mask": mask, "albedo": compare.albedo_of(shot)}, after
 
 
 def stage_of(

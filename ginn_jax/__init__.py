@@ -43,7 +43,8 @@ Modules, in the order the data flows; each imports only what stands before it:
     limits            capacities of all searches, and what they needed
     searches          which searches a network makes, and their capacities' names
     facets            normals and light as means over the samples around
-    geometry          levels, edges and weights of a cloud; demands
+    levels            Poisson disks one of the other, kept from frame to frame
+    geometry          edges and weights of a cloud; demands
     network           f_3D and f_2D
     example           what a training step computes before any parameter enters
     objective         what training minimises
@@ -54,6 +55,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     shading           f_3D of a cloud and f_2D of queries, in every colour channel
     disk_radius       a trained network on finer or coarser points
     upsample          shading at a lower rate, guided by the G-buffer
+    blocks            points padded, queries in blocks for all devices
     inference         f_3D of a cloud once, f_2D at any points, sized by themselves
     image             from a G-buffer to an image
     relight           what does not depend on the light, kept for any light

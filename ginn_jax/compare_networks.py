@@ -11,25 +11,21 @@ from jaxtyping import Array, Float, Key
 
 from ginn_jax import evaluate, evaluate_light
 from ginn_jax.architecture import Network
+from ginn_jax.blocks import largest_block
 from ginn_jax.checkpoint import RECORD, damaged, read_record
-from ginn_jax.compare import Picture, Shot, Values, errors, of_variance, scratch_mib
+from ginn_jax.compare import Picture, Shot, errors, of_variance, scratch_mib
 from ginn_jax.dataset import ShadedPoints, count_given
 from ginn_jax.disk_radius import limits_at, with_disk_radius
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model, Row, View
-from ginn_jax.evaluate_light import LitView
-from ginn_jax.image import within_range
 from ginn_jax.inference import (
-    encode_cloud,
     encode_whole,
-    largest_block,
     only,
     shade_block,
-    shade_points,
     without,
 )
 from ginn_jax.limits import Limits
-from ginn_jax.lit_clouds import LitCloud, mean_light, network_numbers, split_points
+from ginn_jax.lit_clouds import LitCloud, mean_light, split_points
 from ginn_jax.neighbors import bucket
 from ginn_jax.objects import Source
 from ginn_jax.pretrained import load_manifest, load_network
@@ -180,42 +176,6 @@ def codes_kept(row: Row) -> Row:
     return row | {"method": name, "seconds": row["seconds_2d"], "kept": 1}
 
 
-def network_values(
-    trained: Trained, cloud: ShadedPoints | LitCloud, shot: Shot
-) -> tuple[Values, Trained]:
-    """What a network makes of the pixels, not timed."""
-    network, limits, model = trained
-    given = network, limits, model.variables
-    mask = shot.gbuffer.mask
-    pixels = shot.gbuffer.position[mask], shot.gbuffer.normal[mask]
-    if isinstance(cloud, ShadedPoints):
-        ends = cloud.position, cloud.normal
-        encoded, limits = encode_cloud(*given, *ends, key=model.key)
-        values, limits = shade_points(
-            network, limits, model.variables, encoded, *pixels
-        )
-    else:
-        assert isinstance(shot, LitView)
-        encoded, limits = evaluate_light.encode_lit(network, limits, model, cloud)
-        numbers = network_numbers(shot.pixels, evaluate_light.channels_of(encoded))
-        values, limits = shade_points(
-            network, limits, model.variables, encoded, *pixels, *numbers
-        )
-    return within_range(encoded, values), (network, limits, model)
-
-
-def mean_values(
-    own: Values,
-    trained: Trained,
-    cloud: ShadedPoints | LitCloud,
-    shot: Shot,
-    draws: int,
-) -> tuple[str, Values]:
-    """The same of values alone, not timed, and what the mean is called."""
-    others = [network_values(t, cloud, shot)[0] for t in redrawn(trained, draws)]
-    return f"{OURS}, mean of {draws}", np.mean([own, *others], axis=0)
-
-
 def network_memory(trained: Trained, points: int) -> float:
     """Scratch memory of f_3D on so many points and of f_2D on a block on every device.
 
@@ -234,7 +194,7 @@ def network_memory(trained: Trained, points: int) -> float:
         return ends, *numbers
 
     deep = network, without(limits, network.query.name)
-    given = model.variables, *shapes(bucket(points), True), model.key
+    given = model.variables, *shapes(bucket(points), True), None, model.key
     compiled = encode_whole.lower(*deep, *given).compile()
     encoded, _ = jax.eval_shape(partial(encode_whole, *deep), *given)
     kept = sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(encoded.code))

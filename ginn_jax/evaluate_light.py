@@ -6,10 +6,10 @@ over channels and clouds as a ratio of means.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ginn_jax.architecture import Network
 from ginn_jax.camera import Camera, orbit_camera
@@ -51,12 +51,16 @@ class LitView(NamedTuple):
 
 
 def encode_lit(
-    network: Network, limits: Limits, model: Model, cloud: LitCloud
+    network: Network,
+    limits: Limits,
+    model: Model,
+    cloud: LitCloud,
+    kept_before: Bool[Any, "L R"] | None = None,
 ) -> tuple[Encoded, Limits]:
     """f_3D of a cloud; all channels, or one where the light is grey."""
     numbers = distinct_channels(*network_numbers(cloud))
     ends = model.variables, cloud.position, cloud.normal
-    return encode_cloud(network, limits, *ends, *numbers, key=model.key)
+    return encode_cloud(network, limits, *ends, *numbers, kept_before, key=model.key)
 
 
 def distinct_channels(

@@ -4,7 +4,7 @@ Clouds are turned, thinned by Poisson disk sampling and searched; the points tha
 thinning leaves over are asked for their shading and carry the loss.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -123,6 +123,11 @@ def queries_asked(
     if network.asks == "normal":
         return Asked(queries.normal, None)
     return points_asked(queries, material, light)
+
+
+def numbers_asked(network: Network, material: Any, light: Any) -> tuple[Any, Any]:
+    """Material and light of queries as far as f_2D sees them: both, or None."""
+    return (material, light) if network.asks == "all" else (None, None)
 
 
 def left_over(

@@ -7,16 +7,16 @@ same name.
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Int, Key
 
 from ginn_jax.architecture import Conv, Network
 from ginn_jax.candidates import PACKET
 from ginn_jax.facets import Around, facet_field, smooth_normals
-from ginn_jax.hierarchy import Level, LevelLimit, build_level, draw_lots, same_side
+from ginn_jax.hierarchy import same_side
+from ginn_jax.levels import build_levels, grid_of, with_normals
 from ginn_jax.limits import Demands, Limits
-from ginn_jax.packets import Demand, EdgeLimit, Edges
+from ginn_jax.packets import Edges
 from ginn_jax.receptive_field import (
     Field,
     Oriented,
@@ -26,13 +26,14 @@ from ginn_jax.receptive_field import (
     surface_weight,
 )
 from ginn_jax.searches import area_search, needs_areas, search, transposed
-from ginn_jax.voxels import VoxelGrid, build_grid
+from ginn_jax.voxels import VoxelGrid
 
 
 class Geometry(NamedTuple):
     """What f_3D and f_2D need of a cloud.
 
     levels  the hierarchy, finest first; `finest` are its points' rows in the cloud
+    kept    the points of each level by name
     fields  the receptive field of each convolution of f_3D
     area    the area each finest point stands for, where senders are so weighted
     grid    the finest level, ready for f_2D's search
@@ -42,6 +43,7 @@ class Geometry(NamedTuple):
 
     levels: tuple[Oriented, ...]
     finest: Int[Array, "N"]
+    kept: Bool[Array, "L N"]
     fields: dict[str, Field]
     area: Array | None
     grid: VoxelGrid
@@ -93,22 +95,22 @@ def build_geometry(
     limits: Limits,
     cloud: Oriented,
     names: Int[Array, "N"] | None = None,
+    kept_before: Bool[Array, "L N"] | None = None,
     *,
     key: Key[Array, ""],
 ) -> tuple[Geometry, Demands]:
     """All of f_3D's geometry; wrong where a demand exceeds its limit.
 
-    `names` are the rows that the points had before they were sorted. Lots go by name,
-    so that points which move keep their turn, and levels change no more than they must.
+    `names` and `kept_before`: see `build_levels`.
     """
-    if names is None:
-        names = jnp.arange(cloud.mask.shape[0], dtype=jnp.int32)
-    levels, grids, rows, demands = _build_levels(network, limits, cloud, names, key)
+    (levels, rows, kept), grids, demands = build_levels(
+        network, limits, cloud, names, kept_before, key=key
+    )
     facets, around = None, None
     if network.smooth:
         around = Around(cloud, grid_of(network, grids, -1, cloud))
         facets, more = facet_field(network, limits, around, levels[0])
-        levels = _with_normals(levels, smooth_normals(facets, around, levels[0]), rows)
+        levels = with_normals(levels, smooth_normals(facets, around, levels[0]), rows)
         demands |= more
     finest = levels[0]
     found: dict[str, Edges] = {}
@@ -136,71 +138,8 @@ def build_geometry(
         )
         demands |= more
     grid = grid_of(network, grids, 0, finest)
-    made = Geometry(levels, rows[0], fields, areas.get(0), grid, facets, around)
-    return made, demands
-
-
-def grid_of(
-    network: Network, grids: dict[int, VoxelGrid], level: int, points: Oriented
-) -> VoxelGrid:
-    """The grid of a level (-1: the cloud), built when first asked for."""
-    if level not in grids:
-        radii = [
-            c.radius for c in (*network.encoder, network.query) if c.source == level
-        ]
-        cell = min(radii, default=2 * network.levels[0])
-        grids[level] = build_grid(points.position, points.mask, jnp.float32(cell))
-    return grids[level]
-
-
-def _build_levels(
-    network: Network,
-    limits: Limits,
-    cloud: Oriented,
-    names: Int[Array, "N"],
-    key: Key[Array, ""],
-) -> tuple[
-    tuple[Oriented, ...],
-    dict[int, VoxelGrid],
-    list[Int[Array, "_"]],
-    Demands,
-]:
-    """The Poisson disk hierarchy of a cloud, and each level's rows one level finer."""
-    grids: dict[int, VoxelGrid] = {}
-    levels: list[Level] = []
-    demands: Demands = {}
-    points = cloud
-    for i, radius in enumerate(network.levels):
-        parts = [f"level_{i}.{part}" for part in (*Demand._fields, "points")]
-        *searched, kept = (limits.of(part) for part in parts)
-        lots = draw_lots(cloud.mask.shape[0], key=jax.random.fold_in(key, i))
-        level, demand = build_level(
-            grid_of(network, grids, i - 1, points),
-            *points,
-            jnp.float32(radius),
-            LevelLimit(EdgeLimit(*searched), kept),
-            lots[names],
-            network.sided,
-        )
-        names = names[level.index]
-        demands |= dict(zip(parts, (*demand.search, demand.points), strict=True))
-        levels.append(level)
-        points = Oriented(level.position, level.normal, level.mask)
-    ends = tuple(Oriented(lv.position, lv.normal, lv.mask) for lv in levels)
-    return ends, grids, [level.index for level in levels], demands
-
-
-def _with_normals(
-    levels: Sequence[Oriented],
-    normal: Float[Array, "N 3"],
-    rows: Sequence[Int[Array, "_"]],
-) -> tuple[Oriented, ...]:
-    """The levels with these normals of the finest one; `rows` as of `_build_levels`."""
-    turned = [levels[0]._replace(normal=normal)]
-    for level, index in zip(levels[1:], rows[1:], strict=True):
-        found = jnp.where(level.mask[:, None], turned[-1].normal[index], 0.0)
-        turned.append(level._replace(normal=found))
-    return tuple(turned)
+    known = levels, rows[0], kept, fields, areas.get(0)
+    return Geometry(*known, grid, facets, around), demands
 
 
 def _level_areas(

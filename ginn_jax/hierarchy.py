@@ -14,6 +14,8 @@ from ginn_jax.ranges import compact
 from ginn_jax.voxels import VoxelGrid
 
 WAITING, DROPPED, KEPT = 1, 0, 2
+# How near, in radii, points may come to each other that were all kept before.
+HOLD = 0.6
 
 
 @dataclass(frozen=True)
@@ -82,18 +84,40 @@ def sample_disk(
     limit: EdgeLimit,
     lot: UInt32[Array, "N"],
     normal: Float[Array, "N 3"] | None = None,
+    kept_before: Bool[Array, "N"] | None = None,
 ) -> tuple[Bool[Array, "N"], Demand]:
     """Maximal subset with pairwise distance >= radius, greedy in the order of lots.
 
     The parallel Poisson disk sampling of the paper's section "3D Step". `grid` holds
     the same points. Given normals, points that face away from each other may be nearer.
     If the demand exceeds the limit the subset is not valid.
+
+    Of a cloud that moves, points `kept_before` come before all others and drop each
+    other only where they are nearer than `HOLD` radii, so the subset changes little.
     """
+    if kept_before is not None:
+        lot = lot >> 1 | jnp.where(kept_before, jnp.uint32(0), jnp.uint32(1 << 31))
     edges = radius_edges(
         grid, position, mask, radius, limit, lambda s, r: beats(lot, s, r)
     )
     conflict = None if normal is None else same_side(normal, edges)
+    if kept_before is not None:
+        free = ~held(position, radius, kept_before, edges)
+        conflict = free if conflict is None else free & conflict
     return elect(edges.sender, edges.receiver, mask, conflict), edges.demand
+
+
+def held(
+    position: Float[Array, "N 3"],
+    radius: Float[Array, ""],
+    kept_before: Bool[Array, "N"],
+    edges: Edges,
+) -> Bool[Array, "E"]:
+    """Whether both ends of edges within a cloud were kept before and may still be."""
+    ends = jnp.minimum(edges.receiver, kept_before.shape[0] - 1)
+    offset = (axis[edges.sender] - axis[ends] for axis in position.T)
+    apart = sum(a**2 for a in offset) >= (HOLD * radius) ** 2
+    return kept_before[edges.sender] & kept_before[ends] & apart
 
 
 def same_side(normal: Float[Array, "N 3"], edges: Edges) -> Bool[Array, "E"]:
@@ -127,13 +151,14 @@ def build_level(
     limit: LevelLimit,
     lot: UInt32[Array, "N"],
     sided: bool = False,
+    kept_before: Bool[Array, "N"] | None = None,
 ) -> tuple[Level, LevelDemand]:
     """One Poisson disk step; rows beyond the kept ones are zero and masked out.
 
     With `sided`, points that face away from each other may be nearer than `radius`.
     """
-    sides = normal if sided else None
-    kept, search = sample_disk(grid, position, mask, radius, limit.search, lot, sides)
+    more = lot, normal if sided else None, kept_before
+    kept, search = sample_disk(grid, position, mask, radius, limit.search, *more)
     index, real, points = compact(kept, limit.points)
     level = Level(
         jnp.where(real[:, None], position[index], 0.0),

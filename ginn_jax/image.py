@@ -13,10 +13,11 @@ from jaxtyping import Bool, Float, Int
 from ginn_jax.architecture import Network
 from ginn_jax.checks import LARGEST, number
 from ginn_jax.errors import InputError
+from ginn_jax.example import numbers_asked
 from ginn_jax.inference import shade_points
 from ginn_jax.limits import Limits, largest
 from ginn_jax.network import Variables
-from ginn_jax.shading import Encoded, numbers_asked
+from ginn_jax.shading import Encoded
 from ginn_jax.upsample import Surface, sampled, shading_step, upsample
 
 # Cells of space that pixels are sorted into, in radii of f_2D.

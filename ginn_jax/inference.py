@@ -10,12 +10,20 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Bool, Float, Key
 
 from ginn_jax.architecture import Network
+from ginn_jax.blocks import (
+    block_size,
+    in_blocks,
+    largest_block,
+    pad_channels,
+    pad_points,
+)
 from ginn_jax.checks import real_array, unit_rows
-from ginn_jax.dataset import center_of, relative_to
+from ginn_jax.dataset import center_of
 from ginn_jax.errors import InputError
+from ginn_jax.example import numbers_asked
 from ginn_jax.limits import (
     SLACK,
     Demands,
@@ -25,7 +33,7 @@ from ginn_jax.limits import (
     say_raised,
     with_room,
 )
-from ginn_jax.neighbors import bucket, pad_rows
+from ginn_jax.neighbors import bucket
 from ginn_jax.network import Variables
 from ginn_jax.process import ALONE
 from ginn_jax.receptive_field import Oriented
@@ -35,12 +43,9 @@ from ginn_jax.shading import (
     Searched,
     cloud_demands,
     encode,
-    numbers_asked,
     query_demands,
     shade,
 )
-
-BLOCK = 1 << 15
 
 encode_whole = jax.jit(encode, static_argnums=(0, 1))
 shade_block = jax.jit(
@@ -60,14 +65,20 @@ def encode_cloud(
     normal: Float[np.ndarray, "N 3"],
     material: Float[np.ndarray, "C N A"] | None = None,
     light: Float[np.ndarray, "C N L"] | None = None,
+    kept_before: Bool[Any, "L R"] | None = None,
     *,
     key: Key[Array, ""],
 ) -> tuple[Encoded, Limits]:
     """Codes of a cloud, and the limits that sufficed.
 
+    In an animation, samples that move with their surface, give what the frame before
+    `kept` (`nothing_kept` before the first): levels then change as little as they can,
+    and the picture flickers less.
+
     Raises:
         InputError: an empty cloud, or one that is not finite; normals that are not of
-            unit length; material or light that the network does not take.
+            unit length; material or light that the network does not take; or
+            `kept_before` of another cloud.
     """
     if not np.size(position):
         raise InputError("the cloud is empty: sample at least one point")
@@ -75,28 +86,52 @@ def encode_cloud(
     check_numbers("material", material, network.materials, len(position))
     check_numbers("light", light, network.lights, len(position))
     rows = bucket(len(position))
+    check_kept(kept_before, (len(network.levels), rows))
     center = center_of(position)
     cloud = pad_points(center, position, normal, rows)
     more = pad_channels(material, rows), pad_channels(light, rows)
 
     def attempt(limits: Limits) -> tuple[Encoded, list[Demands]]:
         deep = without(limits, network.query.name)
-        made, demands = encode_whole(network, deep, variables, cloud, *more, key)
+        made, demands = encode_whole(
+            network, deep, variables, cloud, *more, kept_before, key
+        )
         return made, [demands]
 
-    measure = partial(cloud_limits, network, cloud, key=key)
+    measure = partial(cloud_limits, network, cloud, kept_before, key=key)
     encoded, sufficed, _ = with_room(limits, attempt, measure)
     say_raised(limits, sufficed)
     return encoded._replace(center=center), sufficed
 
 
-def cloud_limits(network: Network, cloud: Oriented, *, key: Key[Array, ""]) -> Limits:
+def nothing_kept(network: Network, points: int) -> Bool[np.ndarray, "L R"]:
+    """What was kept before the first frame of a cloud of so many points."""
+    return np.zeros((len(network.levels), bucket(points)), bool)
+
+
+def check_kept(kept: Any, shape: tuple[int, int]) -> None:
+    """Raise `InputError` unless these are samples kept of a cloud of that shape."""
+    given = np.zeros(shape, bool) if kept is None else np.asarray(kept)
+    if given.shape != shape or given.dtype != bool:
+        raise InputError(
+            f"kept_before is {given.dtype} {given.shape}, not bool {shape}: give what "
+            "the same network kept of as many points"
+        )
+
+
+def cloud_limits(
+    network: Network,
+    cloud: Oriented,
+    kept_before: Bool[Any, "L R"] | None = None,
+    *,
+    key: Key[Array, ""],
+) -> Limits:
     """Limits that hold what f_3D of a cloud needs, measured with ample ones."""
     ample = uniform_limits(network, 16 * cloud.mask.shape[0])
 
     def probe(limits: Limits, _: int) -> Demands:
         deep = without(limits, network.query.name)
-        return jax.device_get(_cloud_demands(network, deep, cloud, key))
+        return jax.device_get(_cloud_demands(network, deep, cloud, kept_before, key))
 
     return measure_limits(ample, probe, 1, SLACK)
 
@@ -129,27 +164,6 @@ def check_numbers(name: str, numbers: Any, width: int, rows: int) -> None:
         raise InputError(f"{name} holds non-finite numbers: remove those points")
 
 
-def pad_points(
-    center: Float[np.ndarray, "3"] | None,
-    position: Float[np.ndarray, "N 3"],
-    normal: Float[np.ndarray, "N 3"],
-    rows: int,
-) -> Oriented:
-    """Points counted from `center`, and padding up to `rows`."""
-    place, mask = pad_rows(relative_to(center, position), rows)
-    return Oriented(place, pad_rows(np.asarray(normal, np.float32), rows)[0], mask)
-
-
-def pad_channels(
-    numbers: Float[np.ndarray, "C N A"] | None, rows: int
-) -> Float[np.ndarray, "C R A"] | None:
-    """Zeros for rows up to `rows`."""
-    if numbers is None:
-        return None
-    padding = ((0, 0), (0, rows - numbers.shape[1]), (0, 0))
-    return np.pad(np.asarray(numbers, np.float32), padding)
-
-
 def only(limits: Limits, conv: str) -> Limits:
     """The limits of one convolution: others must not make it compile again."""
     return Limits(tuple(s for s in limits.sizes if s[0].startswith(f"{conv}.")))
@@ -158,30 +172,6 @@ def only(limits: Limits, conv: str) -> Limits:
 def without(limits: Limits, conv: str) -> Limits:
     """The limits of everything else."""
     return Limits(tuple(s for s in limits.sizes if not s[0].startswith(f"{conv}.")))
-
-
-def largest_block(lit: bool) -> int:
-    """Queries of a block: half as many where three colours share a core's cache."""
-    return BLOCK // 2 if lit else BLOCK
-
-
-def block_size(points: int, lit: bool) -> int:
-    """Queries of a block such that all devices have about as many to do."""
-    most = largest_block(lit)
-    turns = -(-points // (most * jax.device_count()))
-    return min(most, bucket(-(-points // max(turns * jax.device_count(), 1))))
-
-
-def in_blocks(
-    center: Float[np.ndarray, "3"] | None,
-    position: Float[np.ndarray, "M 3"],
-    normal: Float[np.ndarray, "M 3"],
-    size: int,
-) -> list[Oriented]:
-    """Points counted from `center`, so many at a time; the last block is padded."""
-    rows = -(-len(position) // size) * size
-    points = pad_points(center, position, normal, rows)
-    return [Oriented(*(a[i : i + size] for a in points)) for i in range(0, rows, size)]
 
 
 def _shade_blocks(
@@ -194,7 +184,7 @@ def _shade_blocks(
     limits: Limits,
 ) -> tuple[list[Array], list[Demands]]:
     """Values of every block, which take turns on all devices, and their demands."""
-    needed = {"shader": variables["shader"]}, encoded._replace(center=None)
+    needed = {"shader": variables["shader"]}, encoded._replace(center=None, kept=None)
     copies = [jax.device_put(needed, device) for device in jax.devices()]
     flat = only(limits, network.query.name)
     parts, demands = [], []

@@ -12,19 +12,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ginn_jax.architecture import Network
+from ginn_jax.blocks import block_size, in_blocks, pad_channels, pad_points
 from ginn_jax.checks import unit_rows
 from ginn_jax.dataset import center_of
 from ginn_jax.geometry import Geometry, build_geometry
-from ginn_jax.inference import (
-    block_size,
-    cloud_limits,
-    in_blocks,
-    only,
-    pad_channels,
-    pad_points,
-    query_limits,
-    without,
-)
+from ginn_jax.inference import cloud_limits, only, query_limits, without
 from ginn_jax.limits import Demands, Limits, in_fitting_room, say_raised
 from ginn_jax.lit_clouds import LitCloud, network_numbers
 from ginn_jax.mcconv import stored_kernel

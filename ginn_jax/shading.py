@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from ginn_jax.architecture import Network
 from ginn_jax.candidates import DENSE_PACKET, PACKET
 from ginn_jax.dataset import safe_inverse, unit_light
-from ginn_jax.example import points_asked, queries_asked
+from ginn_jax.example import numbers_asked, points_asked, queries_asked
 from ginn_jax.facets import Around, smooth_light, smooth_queries
 from ginn_jax.geometry import Geometry, build_geometry, build_query_field
 from ginn_jax.limits import Demands, Limits
@@ -40,6 +40,7 @@ class Encoded(NamedTuple):
     Where there is light, `code` has a leading axis of channels and `scale` is the mean
     light of each channel; else `scale` is None. `points` are relative to `center`.
     Where facets are smoothed, `around` are the samples that the queries' are means of.
+    `kept` are the samples that each level keeps, by their rows in the cloud.
     """
 
     points: Oriented
@@ -49,6 +50,7 @@ class Encoded(NamedTuple):
     scale: Float[Array, "C"] | None
     center: Float[Any, "3"] | None = None
     around: Around | None = None
+    kept: Bool[Array, "L N"] | None = None
 
     def searched(self) -> Searched:
         """What the searches of f_2D look into."""
@@ -64,28 +66,36 @@ def encode(
     cloud: Oriented,
     material: Float[Array, "C N A"] | None,
     light: Float[Array, "C N L"] | None,
+    kept_before: Bool[Array, "L N"] | None,
     key: Key[Array, ""],
 ) -> tuple[Encoded, Demands]:
-    """f_3D with all its geometry."""
+    """f_3D with all its geometry; `kept_before` is the `kept` of the frame before."""
     mask = cloud.mask
     cloud, order = in_coherent_order(cloud)
-    geometry, demands = build_geometry(network, limits, cloud, order, key=key)
+    geometry, demands = build_geometry(
+        network, limits, cloud, order, kept_before, key=key
+    )
     code, scale = encode_channels(
         network, variables, geometry, order, mask, material, light
     )
     around = geometry.around
     if around is not None and light is not None:
         around = around._replace(light=light[:, order])
-    ends = geometry.levels[0], geometry.grid, geometry.area
-    return Encoded(*ends, code, scale, around=around), demands
+    ends = geometry.levels[0], geometry.grid, geometry.area, code, scale
+    return Encoded(*ends, around=around, kept=geometry.kept), demands
 
 
 def cloud_demands(
-    network: Network, limits: Limits, cloud: Oriented, key: Key[Array, ""]
+    network: Network,
+    limits: Limits,
+    cloud: Oriented,
+    kept_before: Bool[Array, "L N"] | None,
+    key: Key[Array, ""],
 ) -> Demands:
     """What `encode` needs of every capacity, without f_3D itself."""
     cloud, order = in_coherent_order(cloud)
-    return build_geometry(network, limits, cloud, order, key=key)[1]
+    ends = cloud, order, kept_before
+    return build_geometry(network, limits, *ends, key=key)[1]
 
 
 def encode_channels(
@@ -214,11 +224,6 @@ def shade_channels(
         return values if scale is None else values * scale
 
     return per_channel(channel, code, scale, material, light)
-
-
-def numbers_asked(network: Network, material: Any, light: Any) -> tuple[Any, Any]:
-    """Material and light of queries as far as f_2D sees them: both, or None."""
-    return (material, light) if network.asks == "all" else (None, None)
 
 
 def per_channel(function: Any, *arrays: Any) -> Any:

@@ -21,7 +21,7 @@ from benchmarks import (
     timing,
     train_step,
 )
-from ginn_jax import inference, presets, scenes
+from ginn_jax import blocks, presets, scenes
 from ginn_jax.commandline import hasten
 from ginn_jax.disk_radius import with_disk_radius
 from ginn_jax.errors import InputError
@@ -168,7 +168,7 @@ def test_networks_at_equal_time(tmp_path, monkeypatch):
     monkeypatch.setattr(networks, "step_seconds", step_seconds)
     limits = uniform_limits(network, 1 << 15)
     monkeypatch.setattr("ginn_jax.fit.training_room", lambda *_: Room(limits, limits))
-    monkeypatch.setattr(inference, "BLOCK", 128)
+    monkeypatch.setattr(blocks, "BLOCK", 128)
     monkeypatch.setattr(scenes, "ProcessPoolExecutor", tiny.Here)
     options = networks.Options(
         tmp_path,
@@ -281,7 +281,7 @@ def stand_in(monkeypatch):
     for module in (f2d, scaling):
         monkeypatch.setattr(module, "uniform_limits", lambda *_: tiny.ONE_LEVEL_LIMITS)
     # Every frame has full blocks, so one shape is compiled.
-    monkeypatch.setattr(inference, "BLOCK", 256)
+    monkeypatch.setattr(blocks, "BLOCK", 256)
 
 
 def untrained(config):

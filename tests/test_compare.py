@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments import evaluate as experiment
-from ginn_jax import checkpoint, inference, report, scenes
+from ginn_jax import blocks, checkpoint, report, scenes
 from ginn_jax.compare_networks import OURS, redrawn
 from ginn_jax.compare_report import (
     RIVALS,
@@ -116,7 +116,7 @@ def finished_run(folder, network=tiny.ONE_LEVEL):
 def small_blocks(monkeypatch):
     monkeypatch.setattr(scenes, "ProcessPoolExecutor", tiny.Here)
     # Every picture has full blocks, so one shape is compiled.
-    monkeypatch.setattr(inference, "BLOCK", 128)
+    monkeypatch.setattr(blocks, "BLOCK", 128)
 
 
 def test_draws_are_distinct_and_none_is_the_networks_own():

@@ -10,7 +10,7 @@ import tiny
 
 from benchmarks import poisson_radii
 from experiments import animation, environment_maps, evaluate, latent_features
-from ginn_jax import compare_networks, inference, pretrained, train
+from ginn_jax import blocks, compare_networks, pretrained, train
 from ginn_jax.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("cheap_compiling")
@@ -31,7 +31,7 @@ def untrained(effect):
 @pytest.fixture(autouse=True)
 def tiny_networks(monkeypatch):
     # Every picture has full blocks, so one shape is compiled.
-    monkeypatch.setattr(inference, "BLOCK", 128)
+    monkeypatch.setattr(blocks, "BLOCK", 128)
 
     def load(name, run):
         given = name, run
@@ -49,7 +49,7 @@ def test_animation_tells_the_flicker_of_every_method(tmp_path, effect):
     metrics = animation.main(options)
     rows = {row["method"]: row for row in metrics["flicker"]}
     methods = {"screen space", "visibility bitmask", "ours", "2D only", "3D only"}
-    methods |= {"ours, mean of 2"}
+    methods |= {"ours, mean of 2", "ours, frame by frame"}
     methods -= {"visibility bitmask"} if effect == "sss" else set()
     assert set(rows) == methods
     assert all(np.isfinite(row["flicker"]) for row in rows.values())

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis.extra.numpy import arrays
 from hypothesis.strategies import floats
 
-from ginn_jax import image, inference
+from ginn_jax import blocks, image, inference
 from ginn_jax.errors import InputError
 from ginn_jax.limits import Limits
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
 @pytest.fixture(autouse=True)
 def _small_blocks(monkeypatch):
-    monkeypatch.setattr(inference, "BLOCK", 128)
+    monkeypatch.setattr(blocks, "BLOCK", 128)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def values(variables, encoded):
 
 
 def test_values_do_not_depend_on_blocks(variables, encoded, values, monkeypatch):
-    monkeypatch.setattr(inference, "BLOCK", 512)
+    monkeypatch.setattr(blocks, "BLOCK", 512)
     found, _ = shade(variables, encoded, tiny.sphere_on_plane(PIXELS, 5))
     np.testing.assert_allclose(found, values, atol=1e-5)
 

@@ -11,7 +11,7 @@ import tiny
 from benchmarks import generation
 from benchmarks import relight as relight_benchmark
 from experiments import gi_train, sss_train
-from ginn_jax import evaluate_light, inference, lit_experiment, presets, scenes
+from ginn_jax import blocks, evaluate_light, lit_experiment, presets, scenes
 from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import LitCloud
 from ginn_jax.room import Room
@@ -39,7 +39,7 @@ def test_a_small_run_leaves_all_that_is_promised(effect, tmp_path, monkeypatch):
     script, table, more = EFFECTS[effect]
     network = replace(tiny.ONE_LEVEL, lights=1, **more)
     monkeypatch.setitem(table, "homogeneous", network)
-    monkeypatch.setattr(inference, "BLOCK", 128)
+    monkeypatch.setattr(blocks, "BLOCK", 128)
     # Workers are tested with the scenes.
     monkeypatch.setattr(scenes, "ProcessPoolExecutor", tiny.Here)
     # That they are measured is tested where occlusion is.
@@ -173,7 +173,7 @@ def test_relight_benchmark(tmp_path, monkeypatch):
         repeats=1,
         networks=("illumination, linear",),
     )
-    monkeypatch.setattr(inference, "BLOCK", 128)
+    monkeypatch.setattr(blocks, "BLOCK", 128)
     with tiny.cheap_compiling():
         metrics = relight_benchmark.main(options)
     [row] = metrics["rows"]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import tiny
 
-from ginn_jax import inference, train
+from ginn_jax import blocks, inference, train
 from ginn_jax.lit_clouds import LitCloud, network_numbers
 from ginn_jax.presets import only_2d, only_3d
 from ginn_jax.relight import prepare_relighting, relight
@@ -35,7 +35,7 @@ pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
 @pytest.fixture(autouse=True)
 def _small_blocks(monkeypatch):
-    monkeypatch.setattr(inference, "BLOCK", 512)
+    monkeypatch.setattr(blocks, "BLOCK", 512)
 
 
 def limits_of(network):
