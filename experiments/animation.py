@@ -6,21 +6,28 @@ Flicker is the mean squared change from frame to frame that the reference does n
 `--help` lists every option with its default.
 """
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import jax
 import numpy as np
-from PIL import Image
 from rich.console import Console
 
-from ginn_jax import compare, compare_report, report, sequences
+from ginn_jax import compare, report, sequences
+from ginn_jax.animation_report import (
+    draw_frames,
+    flicker_rows,
+    pooled,
+    write_report,
+)
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
 from ginn_jax.compare import Stage
 from ginn_jax.compare_frames import Playing, shade_next, start_playing
-from ginn_jax.compare_networks import OURS, load_networks
+from ginn_jax.compare_networks import OURS, Trained, load_networks
 from ginn_jax.compare_screen import screen_pictures
 from ginn_jax.compare_tracing import trace
 from ginn_jax.dataset import ShadedPoints
@@ -30,7 +37,6 @@ from ginn_jax.lighting import Light, load_environment, procedural_environment
 from ginn_jax.lit_clouds import mean_light
 from ginn_jax.lit_scenes import light_mesh, lit_points
 from ginn_jax.mesh import Mesh
-from ginn_jax.metrics import tone_map
 from ginn_jax.objects import UNSEEN_SEED
 from ginn_jax.scenes import Occlusion, Settings
 
@@ -50,7 +56,8 @@ class Options:
     only_3d: Path | None = None
     """The same of the 3D-only network."""
     animation: Path | None = None
-    """An .npz of vertices [T V 3] and faces [F 3]; left out, a procedural one."""
+    """An .npz of vertices [T V 3] and faces [F 3], or a folder of them; left out, a
+    procedural one."""
     envmap: Path | None = None
     """An environment map; left out, a procedural sky."""
     frames: int = 12
@@ -86,46 +93,57 @@ def main(options: Options) -> dict[str, Any]:
     console = Console()
     counts = options.points, options.reference
     settings = compare.effect_settings(options.effect, *counts, options.radius)
-    meshes = choose_frames(options, ground=options.effect != "sss")
+    scenes = choose_sequences(options, ground=options.effect != "sss")
     light = choose_light(options)
     key = jax.random.key(options.seed)
     runs = options.checkpoint, options.only_2d, options.only_3d
-    loaded = load_networks(options.effect, settings, runs, key=key)
-    given = meshes[0], settings.points, options.effect != "sss"
-    carried = sequences.carried_samples(*given, seed=options.seed)
-    networks = {
-        name: start_playing(
-            trained, options.draws if name == OURS else 1, settings.points
-        )
-        for name, trained in loaded.items()
-    }
-    frames: dict[str, list[np.ndarray]] = {}
+    networks = load_networks(options.effect, settings, runs, key=key)
+    found = {}
     with bar(console) as progress:
-        task = progress.add_task("frames", total=len(meshes), note="")
-        for number, mesh in enumerate(meshes):
-            # Noise of the reference is another in each frame, as `flicker` expects.
-            seed = options.seed + number
-            found, networks = shade_frame(
-                options, settings, mesh, light, carried, networks, seed=seed
+        total = sum(map(len, scenes.values()))
+        task = progress.add_task("frames", total=total, note="")
+        for name, meshes in scenes.items():
+            frames, networks = shade_sequence(
+                options,
+                settings,
+                meshes,
+                light,
+                networks,
+                partial(progress.advance, task),
             )
-            for name, image in found.items():
-                frames.setdefault(name, []).append(image)
-            progress.advance(task)
-    metrics = measure(options, {name: np.stack(f) for name, f in frames.items()})
+            found[name] = flicker_rows(frames)
+            folder = options.out / name if len(scenes) > 1 else options.out
+            draw_frames(folder, frames)
+    metrics = {
+        "flicker": pooled(list(found.values())),
+        "sequences": found,
+        "options": {k: str(v) for k, v in asdict(options).items()},
+        "environment": report.environment(),
+    }
     report.write_results(options.out, metrics, write_report(metrics))
     for row in metrics["flicker"]:
         console.print(f"{row['method']}: flicker {row['flicker']:.3g}")
     return metrics
 
 
-def choose_frames(options: Options, ground: bool) -> list[Mesh]:
-    """The frames as meshes."""
-    animation = (
-        sequences.procedural_animation(UNSEEN_SEED + options.seed, options.frames)
-        if options.animation is None
-        else sequences.load_animation(options.animation)
+def choose_sequences(options: Options, ground: bool) -> dict[str, list[Mesh]]:
+    """The frames of every sequence as meshes."""
+    found = (
+        {
+            path.stem: sequences.load_animation(path)
+            for path in sequences.find_animations(options.animation)
+        }
+        if options.animation
+        else {
+            "procedural": sequences.procedural_animation(
+                UNSEEN_SEED + options.seed, options.frames
+            )
+        }
     )
-    return sequences.frames_of(animation, options.frames, ground)
+    return {
+        name: sequences.frames_of(animation, options.frames, ground)
+        for name, animation in found.items()
+    }
 
 
 def choose_light(options: Options) -> Light:
@@ -133,6 +151,36 @@ def choose_light(options: Options) -> Light:
     if options.envmap is None:
         return procedural_environment(UNSEEN_SEED + options.seed)
     return load_environment(options.envmap)
+
+
+def shade_sequence(
+    options: Options,
+    settings: Settings,
+    meshes: list[Mesh],
+    light: Light,
+    trained: dict[str, Trained],
+    advance: Callable[[], None],
+) -> tuple[dict[str, np.ndarray], dict[str, Trained]]:
+    """All frames of every method, as `shade_frame` has them, and the networks."""
+    given = meshes[0], settings.points, options.effect != "sss"
+    carried = sequences.carried_samples(*given, seed=options.seed)
+    draws = {name: options.draws if name == OURS else 1 for name in trained}
+    networks = {
+        name: start_playing(network, draws[name], settings.points)
+        for name, network in trained.items()
+    }
+    frames: dict[str, list[np.ndarray]] = {}
+    for number, mesh in enumerate(meshes):
+        # Noise of the reference is another in each frame, as `flicker` expects.
+        seed = options.seed + number
+        found, networks = shade_frame(
+            options, settings, mesh, light, carried, networks, seed=seed
+        )
+        for name, image in found.items():
+            frames.setdefault(name, []).append(image)
+        advance()
+    after = {name: playing.draws[0] for name, playing in networks.items()}
+    return {name: np.stack(images) for name, images in frames.items()}, after
 
 
 def shade_frame(
@@ -181,69 +229,6 @@ def stage_of(
     lit = light_mesh(mesh, light, settings, seed=options.seed)
     cloud = lit_points(lit, samples, options.looks, seed=options.seed)
     return cloud, lit, mean_light(cloud)
-
-
-def measure(options: Options, frames: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Flicker and error of every method; draws the strip and the moving image."""
-    known = "reference", "variance", "mask", "albedo"
-    reference, variance, mask, albedo = (frames[name] for name in known)
-    unit = float(np.mean(reference[mask].astype(np.float64)) ** 2)
-    methods = [name for name in frames if name not in known]
-    rows = []
-    for name in methods:
-        images = frames[name]
-        error = (images.astype(np.float64) - reference) ** 2 - variance
-        change = sequences.flicker(images, reference, variance, mask)
-        error = float(error[mask].mean()) / unit
-        rows.append({"method": name, "flicker": change / unit, "mse_2d": error})
-    draw_frames(options.out, {n: frames[n] * albedo for n in (*methods, "reference")})
-    return {
-        "flicker": rows,
-        "options": {k: str(v) for k, v in asdict(options).items()},
-        "environment": report.environment(),
-    }
-
-
-def draw_frames(out: Path, frames: dict[str, np.ndarray]) -> None:
-    """strip.png, a row a method; animation.gif, all methods side by side."""
-    out.mkdir(parents=True, exist_ok=True)
-    reference = frames["reference"]
-    whole = reference.reshape(-1, *reference.shape[2:])
-    seen = compare_report.foreground(whole)
-
-    def shown(images: np.ndarray) -> np.ndarray:
-        flat = images.reshape(whole.shape)
-        return tone_map(flat, whole, seen).reshape(images.shape)
-
-    mapped = {name: shown(images) for name, images in frames.items()}
-    report.draw_strip(out / "strip.png", mapped)
-    side_by_side = np.concatenate(list(mapped.values()), axis=2)
-    moving = [Image.fromarray((255 * f).astype(np.uint8)) for f in side_by_side]
-    moving[0].save(
-        out / "animation.gif", save_all=True, append_images=moving[1:], duration=60
-    )
-
-
-def write_report(m: dict[str, Any]) -> str:
-    """report.md of an animation."""
-    options, env = m["options"], m["environment"]
-    columns = {"method": "method", "flicker": "flicker", "mse_2d": "2D MSE"}
-    name = "procedural" if options["animation"] == "None" else options["animation"]
-    return f"""# Animation, {options["effect"]}
-
-{Path(name).stem}, {options["frames"]} frames at {options["resolution"]} x
-{options["resolution"]}, reference of {options["reference"]} rays or paths a pixel.
-{env["processor"]}, {env["cores"]} cores.
-
-Flicker is the mean squared change from frame to frame that the reference does not have,
-over pixels seen in both; error and flicker are in units of the squared mean of the
-reference, its noise subtracted. Samples of the object move with their faces.
-
-{report.table_of(m["flicker"], columns)}
-![frames](strip.png)
-
-![moving](animation.gif)
-"""
 
 
 if __name__ == "__main__":

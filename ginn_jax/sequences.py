@@ -34,6 +34,19 @@ class Carried(NamedTuple):
     behind: Bool[np.ndarray, "N"]
 
 
+def find_animations(path: Path) -> list[Path]:
+    """The .npz files of a folder, sorted; or the one file, which need not exist.
+
+    Raises `InputError` where there is none in the folder.
+    """
+    if not path.is_dir():
+        return [path]
+    found = sorted(path.glob("*.npz"))
+    if not found:
+        raise InputError(f"{path}: no animation in this folder; put .npz files there")
+    return found
+
+
 def load_animation(path: Path) -> Animation:
     """An animation from an .npz of `vertices` [T V 3] and `faces` [F 3].
 
