@@ -65,6 +65,8 @@ class Network:
                 maps alone, scaled by features: what an area sends on is a sum over it
     asks        what f_2D sees of a query: its "normal", or "all" its attributes
     splat       whether points are shaded, and their shading only blended at queries
+    taper       how far beyond its radius, as a share of it, a receptive field of f_3D
+                fades out, from as far within; 0: it ends there at once
     smooth      radius within which normals and light of finest points and queries are
                 means over the samples around, see `facets`; 0: they are their own
     """
@@ -87,6 +89,7 @@ class Network:
     beams: int = 0
     asks: Literal["normal", "all"] = "normal"
     splat: bool = False
+    taper: float = 0.0
     smooth: float = 0.0
 
     def __post_init__(self) -> None:
@@ -101,6 +104,7 @@ class Network:
             whole(name, getattr(self, name), least, WIDEST)
         for name in ("materials", "lights", "beams"):
             whole(name, getattr(self, name), 0, WIDEST)
+        number("taper", self.taper, 0.0, 1.0)
         number("smooth", self.smooth, 0.0)
         one_of("density", self.density, ("kde", "surface"))
         one_of("norm", self.norm, ("batch", "layer", "none"))

@@ -24,6 +24,7 @@ from ginn_jax.receptive_field import (
     kernel_inputs,
     point_area,
     surface_weight,
+    window,
 )
 from ginn_jax.searches import area_search, needs_areas, search, transposed
 from ginn_jax.voxels import VoxelGrid
@@ -69,6 +70,7 @@ def receptive_field(
     receivers: Oriented,
     edges: Edges,
     area: Array | None,
+    taper: float = 0.0,
 ) -> tuple[Field, Demands]:
     """Kernel inputs and weights of every edge; `area` is of the senders."""
     radius = jnp.float32(conv.radius)
@@ -86,6 +88,8 @@ def receptive_field(
         )
     else:
         weight = surface_weight(area, edges, receivers.mask.shape[0], radius)
+    if taper:
+        weight *= window(inputs, taper)
     count = edges.demand.edges
     return Field(edges.sender, edges.receiver, inputs, weight, count), demands
 
@@ -122,7 +126,9 @@ def build_geometry(
             found[conv.name] = turn_edges(found[twin], receivers.mask.shape[0], count)
             continue
         grid = grid_of(network, grids, conv.source, levels[conv.source])
-        found[conv.name], more = search(conv, limits, grid, receivers)
+        found[conv.name], more = search(
+            conv, limits, grid, receivers, taper=network.taper
+        )
         demands |= more
     areas = _level_areas(network, levels, found)
     if needs_areas(network):
@@ -133,9 +139,8 @@ def build_geometry(
     fields = {}
     for conv in network.encoder:
         ends = levels[conv.source], levels[conv.target]
-        fields[conv.name], more = receptive_field(
-            network, conv, limits, *ends, found[conv.name], areas.get(conv.source)
-        )
+        given = *ends, found[conv.name], areas.get(conv.source), network.taper
+        fields[conv.name], more = receptive_field(network, conv, limits, *given)
         demands |= more
     grid = grid_of(network, grids, 0, finest)
     known = levels, rows[0], kept, fields, areas.get(0)

@@ -214,10 +214,11 @@ def point_area(
     """Area each point stands for, from the edges of the cloud with itself.
 
     The inverse of a density by the quartic kernel (1 - d^2 / r^2)^2, whose integral
-    over a flat surface is pi r^2 / 3. The density is of the edges that are `counted`.
+    over a flat surface is pi r^2 / 3. The density is of the edges that are `counted`;
+    those that are longer than the radius count nothing.
     """
     offset, real = edge_offsets(position, position, edges)
-    value = (1 - jnp.sum(offset**2, axis=0) / radius**2) ** 2
+    value = jnp.maximum(1 - jnp.sum(offset**2, axis=0) / radius**2, 0.0) ** 2
     real = real if counted is None else real & counted
     total = jax.ops.segment_sum(
         jnp.where(real, value, 0.0),
@@ -236,3 +237,13 @@ def surface_weight(
     """Area of each edge's sender relative to the disk of the receptive field."""
     real = edges.receiver < receivers
     return jnp.where(real, area[edges.sender] / (jnp.pi * radius**2), 0.0)
+
+
+def window(inputs: Float[Array, "D E"], taper: float) -> Float[Array, "E"]:
+    """What edges count for in a field that tapers, by their offset o = (x - y) / r.
+
+    1 up to |o| = 1 - t, 0 from 1 + t on, in between linear in |o|^2: points that pass
+    the border come and go by and by.
+    """
+    squared = jnp.sum(inputs[:3] ** 2, axis=0)
+    return jnp.clip(((1 + taper) ** 2 - squared) / (4 * taper), 0.0, 1.0)

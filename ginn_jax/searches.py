@@ -16,11 +16,16 @@ def search(
     grid: VoxelGrid,
     receivers: Oriented,
     packet: int = PACKET,
+    taper: float = 0.0,
 ) -> tuple[Edges, Demands]:
-    """Edges of one convolution and their demands; `grid` holds the senders."""
+    """Edges of one convolution and their demands; `grid` holds the senders.
+
+    Fields that taper reach further, see `receptive_field.window`.
+    """
     names = [f"{conv.name}.{part}" for part in Demand._fields]
     limit = EdgeLimit(*(limits.of(name) for name in names))
-    ends = grid, receivers.position, receivers.mask, jnp.float32(conv.radius)
+    reach = jnp.float32(conv.radius * (1 + taper))
+    ends = grid, receivers.position, receivers.mask, reach
     edges = radius_edges(*ends, limit, packet=packet)
     return edges, dict(zip(names, edges.demand, strict=True))
 
