@@ -39,6 +39,11 @@ class Conv:
         one_of(f"before of {self.name}", self.before, ("raw", "norm", "dense", "lift"))
 
 
+def reach(radius: float, taper: float) -> float:
+    """How far a receptive field that tapers reaches: see `receptive_field.window`."""
+    return radius * (1 + taper) ** 0.5
+
+
 @dataclass(frozen=True)
 class Network:
     """f_3D and f_2D. Radii are in units of the object's longest side.
@@ -65,8 +70,8 @@ class Network:
                 maps alone, scaled by features: what an area sends on is a sum over it
     asks        what f_2D sees of a query: its "normal", or "all" its attributes
     splat       whether points are shaded, and their shading only blended at queries
-    taper       how far beyond its radius, as a share of it, a receptive field of f_3D
-                fades out, from as far within; 0: it ends there at once
+    taper       width of the border in which receptive fields of f_3D fade out, in the
+                square of the distance over the radius; 0: they end at it at once
     smooth      radius within which normals and light of finest points and queries are
                 means over the samples around, see `facets`; 0: they are their own
     """

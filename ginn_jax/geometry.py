@@ -89,7 +89,7 @@ def receptive_field(
     else:
         weight = surface_weight(area, edges, receivers.mask.shape[0], radius)
     if taper:
-        weight *= window(inputs, taper)
+        weight = weight * window(inputs, taper)
     count = edges.demand.edges
     return Field(edges.sender, edges.receiver, inputs, weight, count), demands
 
@@ -107,7 +107,7 @@ def build_geometry(
 
     `names` and `kept_before`: see `build_levels`.
     """
-    (levels, rows, kept), grids, demands = build_levels(
+    (levels, rows, kept), (grids, found), demands = build_levels(
         network, limits, cloud, names, kept_before, key=key
     )
     facets, around = None, None
@@ -117,8 +117,9 @@ def build_geometry(
         levels = with_normals(levels, smooth_normals(facets, around, levels[0]), rows)
         demands |= more
     finest = levels[0]
-    found: dict[str, Edges] = {}
     for conv in reversed(network.encoder):
+        if conv.name in found:
+            continue
         receivers = levels[conv.target]
         twin = transposed(network, conv)
         if twin in found:

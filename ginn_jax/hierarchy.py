@@ -1,6 +1,5 @@
 """Poisson disk sampling in parallel, and the levels it builds."""
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -16,21 +15,6 @@ from ginn_jax.voxels import VoxelGrid
 WAITING, DROPPED, KEPT = 1, 0, 2
 # How near, in radii, points may come to each other that were all kept before.
 HOLD = 0.6
-
-
-@dataclass(frozen=True)
-class LevelLimit:
-    """Capacities of one Poisson disk step: its search and the points it keeps."""
-
-    search: EdgeLimit
-    points: int
-
-
-class LevelDemand(NamedTuple):
-    """What one Poisson disk step needed."""
-
-    search: Demand
-    points: Int[Array, ""]
 
 
 class Level(NamedTuple):
@@ -95,16 +79,56 @@ def sample_disk(
     Of a cloud that moves, points `kept_before` come before all others and drop each
     other only where they are nearer than `HOLD` radii, so the subset changes little.
     """
-    if kept_before is not None:
-        lot = lot >> 1 | jnp.where(kept_before, jnp.uint32(0), jnp.uint32(1 << 31))
+    lot = thrown_first(lot, kept_before)
     edges = radius_edges(
         grid, position, mask, radius, limit, lambda s, r: beats(lot, s, r)
     )
-    conflict = None if normal is None else same_side(normal, edges)
-    if kept_before is not None:
-        free = ~held(position, radius, kept_before, edges)
-        conflict = free if conflict is None else free & conflict
+    conflict = conflicts(position, radius, edges, normal, kept_before)
     return elect(edges.sender, edges.receiver, mask, conflict), edges.demand
+
+
+def choose_among(
+    edges: Edges,
+    position: Float[Array, "N 3"],
+    mask: Bool[Array, "N"],
+    radius: Float[Array, ""],
+    lot: UInt32[Array, "N"],
+    normal: Float[Array, "N 3"] | None = None,
+    kept_before: Bool[Array, "N"] | None = None,
+) -> Bool[Array, "N"]:
+    """`sample_disk` with all pairs of the cloud at hand that are as near, or nearly."""
+    lot = thrown_first(lot, kept_before)
+    sender, receiver = edges.sender, jnp.minimum(edges.receiver, mask.shape[0] - 1)
+    conflict = beats(lot, sender, receiver) & (
+        squared_lengths(position, edges) < radius**2
+    )
+    more = conflicts(position, radius, edges, normal, kept_before)
+    conflict = conflict if more is None else conflict & more
+    return elect(sender, edges.receiver, mask, conflict)
+
+
+def thrown_first(
+    lot: UInt32[Array, "N"], kept_before: Bool[Array, "N"] | None
+) -> UInt32[Array, "N"]:
+    """Lots with which points that were kept before come before all others."""
+    if kept_before is None:
+        return lot
+    return lot >> 1 | jnp.where(kept_before, jnp.uint32(0), jnp.uint32(1 << 31))
+
+
+def conflicts(
+    position: Float[Array, "N 3"],
+    radius: Float[Array, ""],
+    edges: Edges,
+    normal: Float[Array, "N 3"] | None,
+    kept_before: Bool[Array, "N"] | None,
+) -> Bool[Array, "E"] | None:
+    """Which pairs within the radius may not both be kept; None: all of them."""
+    conflict = None if normal is None else same_side(normal, edges)
+    if kept_before is None:
+        return conflict
+    free = ~held(position, radius, kept_before, edges)
+    return free if conflict is None else free & conflict
 
 
 def held(
@@ -115,9 +139,15 @@ def held(
 ) -> Bool[Array, "E"]:
     """Whether both ends of edges within a cloud were kept before and may still be."""
     ends = jnp.minimum(edges.receiver, kept_before.shape[0] - 1)
-    offset = (axis[edges.sender] - axis[ends] for axis in position.T)
-    apart = sum(a**2 for a in offset) >= (HOLD * radius) ** 2
+    apart = squared_lengths(position, edges) >= (HOLD * radius) ** 2
     return kept_before[edges.sender] & kept_before[ends] & apart
+
+
+def squared_lengths(position: Float[Array, "N 3"], edges: Edges) -> Float[Array, "E"]:
+    """Of edges within a cloud."""
+    ends = jnp.minimum(edges.receiver, position.shape[0] - 1)
+    x, y, z = (axis[edges.sender] - axis[ends] for axis in position.T)
+    return x * x + y * y + z * z
 
 
 def same_side(normal: Float[Array, "N 3"], edges: Edges) -> Bool[Array, "E"]:
@@ -143,30 +173,20 @@ def beats(
 
 
 def build_level(
-    grid: VoxelGrid,
+    kept: Bool[Array, "N"],
     position: Float[Array, "N 3"],
     normal: Float[Array, "N 3"],
-    mask: Bool[Array, "N"],
-    radius: Float[Array, ""],
-    limit: LevelLimit,
-    lot: UInt32[Array, "N"],
-    sided: bool = False,
-    kept_before: Bool[Array, "N"] | None = None,
-) -> tuple[Level, LevelDemand]:
-    """One Poisson disk step; rows beyond the kept ones are zero and masked out.
-
-    With `sided`, points that face away from each other may be nearer than `radius`.
-    """
-    more = lot, normal if sided else None, kept_before
-    kept, search = sample_disk(grid, position, mask, radius, limit.search, *more)
-    index, real, points = compact(kept, limit.points)
+    capacity: int,
+) -> tuple[Level, Int[Array, ""]]:
+    """The points kept, and how many; rows beyond them are zero and masked out."""
+    index, real, points = compact(kept, capacity)
     level = Level(
         jnp.where(real[:, None], position[index], 0.0),
         jnp.where(real[:, None], normal[index], 0.0),
         index,
         real,
     )
-    return level, LevelDemand(search, points)
+    return level, points
 
 
 def poisson_disk(

@@ -11,13 +11,14 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from ginn_jax.architecture import Network
-from ginn_jax.hierarchy import Level, LevelLimit, build_level, draw_lots
+from ginn_jax.hierarchy import Level, build_level, choose_among, draw_lots, sample_disk
 from ginn_jax.limits import Demands, Limits
-from ginn_jax.packets import Demand, EdgeLimit
+from ginn_jax.packets import Demand, EdgeLimit, Edges
 from ginn_jax.receptive_field import Oriented
+from ginn_jax.searches import search, shared_search
 from ginn_jax.voxels import VoxelGrid, build_grid
 
 
@@ -33,6 +34,13 @@ class Levels(NamedTuple):
     kept: Bool[Array, "L N"]
 
 
+class Found(NamedTuple):
+    """Grids by level (-1: the cloud) and edges by convolution, as far as searched."""
+
+    grids: dict[int, VoxelGrid]
+    edges: dict[str, Edges]
+
+
 def build_levels(
     network: Network,
     limits: Limits,
@@ -41,40 +49,61 @@ def build_levels(
     kept_before: Bool[Array, "L N"] | None = None,
     *,
     key: Key[Array, ""],
-) -> tuple[Levels, dict[int, VoxelGrid], Demands]:
-    """The Poisson disk hierarchy of a cloud, and the grids it was found with.
+) -> tuple[Levels, Found, Demands]:
+    """The Poisson disk hierarchy of a cloud, and the searches that found it.
 
     `names` are the rows that the points had before they were sorted, `kept_before` the
     names of those that levels kept when the points lay elsewhere (see `sample_disk`).
     """
     count = cloud.mask.shape[0]
     names = jnp.arange(count, dtype=jnp.int32) if names is None else names
-    grids: dict[int, VoxelGrid] = {}
+    found, demands = Found({}, {}), {}
     levels: list[Level] = []
     kept: list[Bool[Array, "N"]] = []
-    demands: Demands = {}
     points = cloud
-    for i, radius in enumerate(network.levels):
-        parts = [f"level_{i}.{part}" for part in (*Demand._fields, "points")]
-        *searched, most = (limits.of(part) for part in parts)
-        lots = draw_lots(count, key=jax.random.fold_in(key, i))
-        level, demand = build_level(
-            grid_of(network, grids, i - 1, points),
-            *points,
-            jnp.float32(radius),
-            LevelLimit(EdgeLimit(*searched), most),
-            lots[names],
-            network.sided,
-            None if kept_before is None else kept_before[i][names],
-        )
+    for i in range(len(network.levels)):
+        lots = draw_lots(count, key=jax.random.fold_in(key, i))[names]
+        before = None if kept_before is None else kept_before[i][names]
+        chosen, more = _choose(network, limits, found, i, points, lots, before)
+        room = f"level_{i}.points"
+        ends = points.position, points.normal
+        level, needed = build_level(chosen, *ends, limits.of(room))
         names = names[level.index]
-        demands |= dict(zip(parts, (*demand.search, demand.points), strict=True))
+        demands |= more | {room: needed}
         levels.append(level)
         kept.append(_named(names, level.mask, count))
         points = Oriented(level.position, level.normal, level.mask)
     ends = tuple(Oriented(lv.position, lv.normal, lv.mask) for lv in levels)
     rows = tuple(level.index for level in levels)
-    return Levels(ends, rows, jnp.stack(kept)), grids, demands
+    return Levels(ends, rows, jnp.stack(kept)), found, demands
+
+
+def _choose(
+    network: Network,
+    limits: Limits,
+    found: Found,
+    level: int,
+    points: Oriented,
+    lots: UInt32[Array, "N"],
+    before: Bool[Array, "N"] | None,
+) -> tuple[Bool[Array, "N"], Demands]:
+    """Which points of the level before are kept in this one.
+
+    Where a convolution within the level before reaches as far its edges will do.
+    """
+    grid = grid_of(network, found.grids, level - 1, points)
+    position, normal, mask = points
+    radius = jnp.float32(network.levels[level])
+    more = lots, normal if network.sided else None, before
+    conv = shared_search(network, level)
+    if conv is None:
+        names = [f"level_{level}.{part}" for part in Demand._fields]
+        limit = EdgeLimit(*(limits.of(name) for name in names))
+        kept, demand = sample_disk(grid, position, mask, radius, limit, *more)
+        return kept, dict(zip(names, demand, strict=True))
+    edges, demands = search(conv, limits, grid, points, taper=network.taper)
+    found.edges[conv.name] = edges
+    return choose_among(edges, position, mask, radius, *more), demands
 
 
 def _named(

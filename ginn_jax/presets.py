@@ -121,7 +121,9 @@ def with_ablations(network: Network) -> dict[str, Network]:
 
 
 # Creases are dark over a hundredth of the object: finer points than light needs.
-DEFAULT = compact_network(levels=(0.01, 0.03, 0.1), query_radius=0.02, sided=True)
+DEFAULT = compact_network(
+    levels=(0.01, 0.03, 0.1), query_radius=0.02, sided=True, taper=0.45
+)
 
 
 PRESETS = {"default": DEFAULT, "paper": PAPER, "released": RELEASED}
@@ -134,7 +136,9 @@ PRESETS |= with_ablations(DEFAULT)
 _FAR = {"k": 16, "lights": 1}
 
 
-_DIFFUSE = compact_network(levels=(0.02, 0.05, 0.1, 0.2), materials=1, **_FAR)
+_DIFFUSE = compact_network(
+    levels=(0.02, 0.05, 0.1, 0.2), materials=1, taper=0.4, **_FAR
+)
 
 
 # Most media are dense: light leaves them near to where it entered.

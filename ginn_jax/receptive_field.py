@@ -214,8 +214,8 @@ def point_area(
     """Area each point stands for, from the edges of the cloud with itself.
 
     The inverse of a density by the quartic kernel (1 - d^2 / r^2)^2, whose integral
-    over a flat surface is pi r^2 / 3. The density is of the edges that are `counted`;
-    those that are longer than the radius count nothing.
+    over a flat surface is pi r^2 / 3. The density is of the edges that are `counted`
+    and no longer than the radius.
     """
     offset, real = edge_offsets(position, position, edges)
     value = jnp.maximum(1 - jnp.sum(offset**2, axis=0) / radius**2, 0.0) ** 2
@@ -242,8 +242,8 @@ def surface_weight(
 def window(inputs: Float[Array, "D E"], taper: float) -> Float[Array, "E"]:
     """What edges count for in a field that tapers, by their offset o = (x - y) / r.
 
-    1 up to |o| = 1 - t, 0 from 1 + t on, in between linear in |o|^2: points that pass
-    the border come and go by and by.
+    1 up to |o|^2 = 1 - taper, 0 from 1 + taper on, linear in between: points that pass
+    the border come and go by and by. In a plane it adds up to what a sharp border does.
     """
-    squared = jnp.sum(inputs[:3] ** 2, axis=0)
-    return jnp.clip(((1 + taper) ** 2 - squared) / (4 * taper), 0.0, 1.0)
+    x, y, z = inputs[:3]
+    return jnp.clip((1 + taper - (x * x + y * y + z * z)) / (2 * taper), 0.0, 1.0)

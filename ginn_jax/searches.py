@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from ginn_jax.architecture import QUERY, Conv, Network
+from ginn_jax.architecture import QUERY, Conv, Network, reach
 from ginn_jax.candidates import PACKET
 from ginn_jax.limits import Demands, Limits
 from ginn_jax.packets import Demand, EdgeLimit, Edges, radius_edges
@@ -20,23 +20,22 @@ def search(
 ) -> tuple[Edges, Demands]:
     """Edges of one convolution and their demands; `grid` holds the senders.
 
-    Fields that taper reach further, see `receptive_field.window`.
+    Fields that taper reach further, see `window`.
     """
     names = [f"{conv.name}.{part}" for part in Demand._fields]
     limit = EdgeLimit(*(limits.of(name) for name in names))
-    reach = jnp.float32(conv.radius * (1 + taper))
-    ends = grid, receivers.position, receivers.mask, reach
+    radius = jnp.float32(reach(conv.radius, taper))
+    ends = grid, receivers.position, receivers.mask, radius
     edges = radius_edges(*ends, limit, packet=packet)
     return edges, dict(zip(names, edges.demand, strict=True))
 
 
 def limit_names(network: Network) -> tuple[str, ...]:
     """The name of every capacity of a network."""
-    names = [
-        f"level_{i}.{part}"
-        for i in range(len(network.levels))
-        for part in (*Demand._fields, "points")
-    ]
+    names = []
+    for i in range(len(network.levels)):
+        own = () if shared_search(network, i) else Demand._fields
+        names += [f"level_{i}.{part}" for part in (*own, "points")]
     more = [area_search(network)] if needs_areas(network) else []
     for conv in (*more, *facet_searches(network)):
         names += [f"{conv.name}.{part}" for part in Demand._fields]
@@ -46,6 +45,16 @@ def limit_names(network: Network) -> tuple[str, ...]:
         names += [f"{conv.name}.{part}" for part in Demand._fields]
         names += [f"{conv.name}.pairs"] if network.density == "kde" else []
     return tuple(names)
+
+
+def shared_search(network: Network, level: int) -> Conv | None:
+    """The convolution whose edges tell the Poisson disks of a level as well, if any:
+    that within the level before, where it reaches as far."""
+    for conv in network.encoder:
+        within = conv.source == conv.target == level - 1
+        if within and reach(conv.radius, network.taper) >= network.levels[level]:
+            return conv
+    return None
 
 
 def needs_areas(network: Network) -> bool:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny
+from disks import Room, build_level
 from hypothesis import Phase, given, settings
 from oracles import neighbors
 from strategies import ALL_PAIRS, POINTS, SEEDS, padded
@@ -46,7 +47,7 @@ def level(cloud, seed, limit):
     key = jax.random.key(seed)
     position, mask = cloud
     ends = position, position, mask
-    return hierarchy.build_level(
+    return build_level(
         grid, *ends, RADIUS, limit, hierarchy.draw_lots(len(ends[0]), key=key)
     )
 
@@ -104,7 +105,7 @@ def test_a_search_wants_what_it_says(cloud):
 @given(padded(), SEEDS)
 def test_a_level_wants_what_it_says(cloud, seed):
     build = lambda search, points: jax.device_get(  # noqa: E731
-        level(cloud, seed, hierarchy.LevelLimit(search, points))
+        level(cloud, seed, Room(search, points))
     )
     roomy, need = build(ALL_PAIRS, POINTS)
     kept = roomy.index[roomy.mask].tolist()

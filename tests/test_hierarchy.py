@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from disks import Room, build_level
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import dart_throwing, distance
@@ -19,7 +20,7 @@ from ginn_jax.voxels import build_grid
 NORMAL = np.arange(3.0 * POINTS, dtype=np.float32).reshape(POINTS, 3)
 # On the host each number of conflicts is compiled anew.
 FEWER = settings(max_examples=12)
-FULL = hi.LevelLimit(ALL_PAIRS, POINTS)
+FULL = Room(ALL_PAIRS, POINTS)
 
 
 @partial(jax.jit, static_argnames=("limit", "sided"))
@@ -27,7 +28,7 @@ def build(cloud, normal, radius, seed, limit, sided=False):
     grid = build_grid(*cloud, radius)
     key = jax.random.key(seed)
     position, mask = cloud
-    return hi.build_level(
+    return build_level(
         grid,
         position,
         normal,
@@ -182,14 +183,14 @@ def dense():
 def test_too_few_edges_are_told(dense):
     cloud, _, need = dense
     short = replace(ALL_PAIRS, edges=int(need.search.edges) - 1)
-    demand = level_of(cloud, 0.4, 0, hi.LevelLimit(short, POINTS))[1]
+    demand = level_of(cloud, 0.4, 0, Room(short, POINTS))[1]
     assert demand.search == need.search
 
 
 def test_too_few_points_are_told_and_the_first_are_kept(dense):
     cloud, level, need = dense
     room = int(need.points) - 1
-    short, demand = level_of(cloud, 0.4, 0, hi.LevelLimit(ALL_PAIRS, room))
+    short, demand = level_of(cloud, 0.4, 0, Room(ALL_PAIRS, room))
     assert demand == need
     assert short.mask.all()
     np.testing.assert_array_equal(short.index, level.index[:room])

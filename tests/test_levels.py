@@ -15,6 +15,7 @@ from small_sphere import CLOUD, LEVELS, NETWORKS, as_numpy, generous
 from strategies import ALL_PAIRS, POINTS, SEEDS, padded
 
 from ginn_jax import hierarchy, inference, levels
+from ginn_jax.packets import radius_edges
 from ginn_jax.voxels import build_grid
 
 pytestmark = pytest.mark.usefixtures("cheap_compiling")
@@ -22,6 +23,12 @@ pytestmark = pytest.mark.usefixtures("cheap_compiling")
 # No distance between points on the tests' lattices, nor is `HOLD` of it.
 RADIUS = 0.297
 MASKS = hnp.arrays(bool, POINTS)
+
+
+def rows_within(reach):
+    """Rows of numbers drawn one by one, so that no two are the same by default."""
+    elements = st.floats(-reach, reach, width=32)
+    return hnp.arrays(np.float32, (POINTS, 3), elements=elements, fill=st.nothing())
 
 
 @jax.jit
@@ -57,16 +64,30 @@ def test_points_kept_before_are_thrown_first_and_bear_each_other(cloud, seed, be
     np.testing.assert_array_equal(found, expected)
 
 
+@jax.jit
+def sample_by_edges(cloud, seed, kept_before, normal):
+    """With and without pairs at hand, which are also of those half as far again."""
+    position, mask = cloud
+    radius = jnp.float32(RADIUS)
+    grid = build_grid(position, mask, radius)
+    lots = hierarchy.draw_lots(POINTS, key=jax.random.key(seed))
+    edges = radius_edges(grid, position, mask, 1.5 * radius, ALL_PAIRS)
+    more = lots, normal, kept_before
+    chosen = hierarchy.choose_among(edges, position, mask, radius, *more)
+    given = grid, position, mask, radius, ALL_PAIRS, *more
+    return chosen, hierarchy.sample_disk(*given)[0]
+
+
+@given(padded(), SEEDS, MASKS, rows_within(1.0))
+def test_edges_at_hand_give_the_same_sample_as_a_search(cloud, seed, before, normal):
+    chosen, searched = sample_by_edges(cloud, seed, before, normal)
+    np.testing.assert_array_equal(chosen, searched)
+
+
 @given(padded(), SEEDS, SEEDS)
 def test_a_cloud_that_stays_keeps_its_points_whatever_the_lots(cloud, seed, other):
     first = np.asarray(sample(cloud, seed))
     np.testing.assert_array_equal(sample(cloud, other, first), first)
-
-
-def rows_within(reach):
-    """Rows of numbers drawn one by one, so that no two are the same by default."""
-    elements = st.floats(-reach, reach, width=32)
-    return hnp.arrays(np.float32, (POINTS, 3), elements=elements, fill=st.nothing())
 
 
 @given(padded(source=rows_within(0.375)), SEEDS, rows_within(0.125))

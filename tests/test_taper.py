@@ -16,7 +16,7 @@ from ginn_jax.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
-TAPER = 0.3
+TAPER = 0.5
 TAPERS = st.sampled_from([0.1, 0.25, 1.0])
 OFFSETS = hnp.arrays(
     np.float32, (7, 24), elements=st.floats(-1.5, 1.5, width=32), fill=st.nothing()
@@ -28,15 +28,22 @@ def test_window_falls_from_one_to_nothing_across_the_border(inputs, taper):
     """Only the first three rows are the offset."""
     found = np.asarray(rf.window(jnp.asarray(inputs), taper))
     for column, value in zip(inputs.astype(np.float64).T, found, strict=True):
-        length = oracles.distance(column[:3], np.zeros(3))
-        if length <= 1 - taper:
+        squared = oracles.distance(column[:3], np.zeros(3)) ** 2
+        if squared <= 1 - taper:
             assert value == 1
-        elif length >= 1 + taper:
+        elif squared >= 1 + taper:
             assert value == pytest.approx(0, abs=1e-5)
         else:
-            low, high = (1 - taper) ** 2, (1 + taper) ** 2
-            share = (high - length**2) / (high - low)
+            share = (1 + taper - squared) / (2 * taper)
             assert value == pytest.approx(share, abs=1e-5)
+
+
+@given(TAPERS)
+def test_window_adds_up_to_the_sharp_disk(taper):
+    steps = np.linspace(-1.5, 1.5, 601, dtype=np.float32)
+    x, y = (a.reshape(-1) for a in np.meshgrid(steps, steps))
+    found = np.asarray(rf.window(jnp.stack([x, 0 * x, y]), taper), np.float64)
+    assert found.sum() * 0.005**2 == pytest.approx(np.pi, rel=1e-3)
 
 
 @pytest.fixture(scope="module", params=NETWORKS)
@@ -57,7 +64,7 @@ def real_rows(points):
 
 def test_fields_of_f_3d_reach_further_that_of_f_2d_does_not(built):
     network, geometry, query_field, _ = built
-    reach = {c.name: c.radius * (1 + TAPER) for c in network.encoder}
+    reach = {c.name: c.radius * np.sqrt(1 + TAPER) for c in network.encoder}
     reach[network.query.name] = network.query.radius
     for conv in (*network.encoder, network.query):
         asked = conv is network.query
@@ -88,7 +95,7 @@ def test_weights_are_those_of_areas_in_the_window(built, sharp):
         x = geometry.levels[conv.target].position[field.receiver[real]]
         y = geometry.levels[0].position[field.sender[real]]
         squared = np.sum((x.astype(np.float64) - y) ** 2, axis=1) / conv.radius**2
-        share = np.clip(((1 + TAPER) ** 2 - squared) / (4 * TAPER), 0, 1)
+        share = np.clip((1 + TAPER - squared) / (2 * TAPER), 0, 1)
         area = plain.area[field.sender[real]].astype(np.float64)
         expected = share * area / (np.pi * conv.radius**2)
         np.testing.assert_allclose(field.weight[real], expected, rtol=1e-3, atol=1e-6)
