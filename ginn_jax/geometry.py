@@ -34,22 +34,22 @@ class Geometry(NamedTuple):
     """What f_3D and f_2D need of a cloud.
 
     levels  the hierarchy, finest first; `finest` are its points' rows in the cloud
-    kept    the points of each level by name
     fields  the receptive field of each convolution of f_3D
     area    the area each finest point stands for, where senders are so weighted
     grid    the finest level, ready for f_2D's search
     facets  the samples around each finest point, where facets are smoothed
     around  the cloud, ready to be searched for those around queries
+    kept    which points of the cloud each level holds, by name
     """
 
     levels: tuple[Oriented, ...]
     finest: Int[Array, "N"]
-    kept: Bool[Array, "L N"]
     fields: dict[str, Field]
     area: Array | None
     grid: VoxelGrid
     facets: Field | None = None
     around: Around | None = None
+    kept: Bool[Array, "L N"] | None = None
 
 
 def turn_edges(edges: Edges, senders: int, receivers: int) -> Edges:
@@ -144,8 +144,8 @@ def build_geometry(
         fields[conv.name], more = receptive_field(network, conv, limits, *given)
         demands |= more
     grid = grid_of(network, grids, 0, finest)
-    known = levels, rows[0], kept, fields, areas.get(0)
-    return Geometry(*known, grid, facets, around), demands
+    known = levels, rows[0], fields, areas.get(0), grid
+    return Geometry(*known, facets, around, kept), demands
 
 
 def _level_areas(
