@@ -105,5 +105,7 @@ def _table_of_sequences(found: dict[str, Rows]) -> str:
 
 
 def _pictures(folder: str) -> str:
-    place = f"{folder}/" if folder else ""
-    return f"![frames]({place}strip.png)\n\n![moving]({place}animation.gif)\n"
+    """The strip and the moving image; of several sequences only what moves."""
+    if folder:
+        return f"![{folder}]({folder}/animation.gif)\n\n"
+    return "![frames](strip.png)\n\n![moving](animation.gif)\n"

@@ -127,3 +127,14 @@ def test_what_is_no_animation_is_refused(tmp_path):
     one = np.zeros((2, 3, 3), np.float32)
     with pytest.raises(InputError, match="coincide"):
         sequences.frames_of(sequences.Animation(one, np.array([[0, 1, 2]])), 2, False)
+
+
+def test_a_folder_stands_for_its_animations_sorted(tmp_path):
+    with pytest.raises(InputError, match="no animation in this folder"):
+        sequences.find_animations(tmp_path)
+    for name in ("b.npz", "a.npz", "notes.txt"):
+        (tmp_path / name).touch()
+    found = sequences.find_animations(tmp_path)
+    assert [path.name for path in found] == ["a.npz", "b.npz"]
+    missing = tmp_path / "c.npz"
+    assert sequences.find_animations(missing) == [missing]
