@@ -55,8 +55,8 @@ TABLE: Table = {
         ({"position": WORDS}, "the cloud holds <U1: give real numbers"),
         ({"position": POINTS * NAN}, "the cloud holds non-finite"),
         ({"normal": UP * 0}, "normals are .* not of unit length"),
-        ({"kept_before": np.zeros((2, 64), np.int8)}, r"kept_before is int8 \(2, 64\)"),
-        ({"kept_before": np.zeros((2, 20), bool)}, r"bool \(2, 20\), not bool \(2, 64"),
+        ({"kept_before": np.zeros((2, 48), np.int8)}, r"kept_before is int8 \(2, 48\)"),
+        ({"kept_before": np.zeros((2, 20), bool)}, r"bool \(2, 20\), not bool \(2, 48"),
         ({"light": np.ones((3, 20, 1))}, "the network takes no light: leave it out"),
         ({"network": LIT}, r"light is \(0,\), the network takes \[C 20 1\]"),
         (

@@ -59,7 +59,7 @@ def values(variables, encoded):
     """At 300 points, in blocks of 128."""
     points = tiny.sphere_on_plane(PIXELS, 5)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(inference, "BLOCK", 128)
+        patch.setattr(blocks, "BLOCK", 128)
         found, limits = shade(variables, encoded, points)
         again, same = shade(variables, encoded, points, limits)
     # Of f_2D's room, which is ample, what is left fits and gives the same values.
