@@ -16,9 +16,9 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 from ginn_jax.architecture import Network
 from ginn_jax.hierarchy import Level, build_level, choose_among, draw_lots, sample_disk
 from ginn_jax.limits import Demands, Limits
-from ginn_jax.packets import Demand, EdgeLimit, Edges
+from ginn_jax.packets import Edges
 from ginn_jax.receptive_field import Oriented
-from ginn_jax.searches import search, shared_search
+from ginn_jax.searches import search, search_demands, search_limit, shared_search
 from ginn_jax.voxels import VoxelGrid, build_grid
 
 
@@ -97,10 +97,10 @@ def _choose(
     more = lots, normal if network.sided else None, before
     conv = shared_search(network, level)
     if conv is None:
-        names = [f"level_{level}.{part}" for part in Demand._fields]
-        limit = EdgeLimit(*(limits.of(name) for name in names))
+        name = f"level_{level}"
+        limit = search_limit(limits, name)
         kept, demand = sample_disk(grid, position, mask, radius, limit, *more)
-        return kept, dict(zip(names, demand, strict=True))
+        return kept, search_demands(name, demand)
     edges, demands = search(conv, limits, grid, points, taper=network.taper)
     found.edges[conv.name] = edges
     return choose_among(edges, position, mask, radius, *more), demands

@@ -22,12 +22,20 @@ def search(
 
     Fields that taper reach further, see `window`.
     """
-    names = [f"{conv.name}.{part}" for part in Demand._fields]
-    limit = EdgeLimit(*(limits.of(name) for name in names))
     radius = jnp.float32(reach(conv.radius, taper))
     ends = grid, receivers.position, receivers.mask, radius
-    edges = radius_edges(*ends, limit, packet=packet)
-    return edges, dict(zip(names, edges.demand, strict=True))
+    edges = radius_edges(*ends, search_limit(limits, conv.name), packet=packet)
+    return edges, search_demands(conv.name, edges.demand)
+
+
+def search_limit(limits: Limits, name: str) -> EdgeLimit:
+    """The capacities of the search of that name."""
+    return EdgeLimit(*(limits.of(f"{name}.{part}") for part in Demand._fields))
+
+
+def search_demands(name: str, demand: Demand) -> Demands:
+    """What that search needed, under the names of its capacities."""
+    return {f"{name}.{part}": n for part, n in demand._asdict().items()}
 
 
 def limit_names(network: Network) -> tuple[str, ...]:
