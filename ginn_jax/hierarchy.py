@@ -98,13 +98,14 @@ def choose_among(
 ) -> Bool[Array, "N"]:
     """`sample_disk` with all pairs of the cloud at hand that are as near, or nearly."""
     lot = thrown_first(lot, kept_before)
-    sender, receiver = edges.sender, jnp.minimum(edges.receiver, mask.shape[0] - 1)
-    conflict = beats(lot, sender, receiver) & (
-        squared_lengths(position, edges) < radius**2
-    )
+    conflict = squared_lengths(position, edges) < radius**2
+    conflict &= beats(lot, *pair_rows(edges, mask.shape[0]))
     more = conflicts(position, radius, edges, normal, kept_before)
     conflict = conflict if more is None else conflict & more
-    return elect(sender, edges.receiver, mask, conflict)
+    # Of the two edges of a pair one at most is a conflict: half the room will do.
+    rows, real, _ = compact(conflict, (conflict.size + 1) // 2)
+    receiver = jnp.where(real, edges.receiver[rows], mask.shape[0])
+    return elect(edges.sender[rows], receiver, mask)
 
 
 def thrown_first(
@@ -138,22 +139,27 @@ def held(
     edges: Edges,
 ) -> Bool[Array, "E"]:
     """Whether both ends of edges within a cloud were kept before and may still be."""
-    ends = jnp.minimum(edges.receiver, kept_before.shape[0] - 1)
+    sender, receiver = pair_rows(edges, kept_before.shape[0])
     apart = squared_lengths(position, edges) >= (HOLD * radius) ** 2
-    return kept_before[edges.sender] & kept_before[ends] & apart
+    return kept_before[sender] & kept_before[receiver] & apart
+
+
+def pair_rows(edges: Edges, count: int) -> tuple[Int[Array, "E"], Int[Array, "E"]]:
+    """Sender and receiver of edges within a cloud; padded ones get its last row."""
+    return edges.sender, jnp.minimum(edges.receiver, count - 1)
 
 
 def squared_lengths(position: Float[Array, "N 3"], edges: Edges) -> Float[Array, "E"]:
     """Of edges within a cloud."""
-    ends = jnp.minimum(edges.receiver, position.shape[0] - 1)
-    x, y, z = (axis[edges.sender] - axis[ends] for axis in position.T)
+    sender, receiver = pair_rows(edges, position.shape[0])
+    x, y, z = (axis[sender] - axis[receiver] for axis in position.T)
     return x * x + y * y + z * z
 
 
 def same_side(normal: Float[Array, "N 3"], edges: Edges) -> Bool[Array, "E"]:
     """Whether the ends of edges within a cloud do not face away from each other."""
-    ends = jnp.minimum(edges.receiver, normal.shape[0] - 1)
-    x, y, z = (axis[edges.sender] * axis[ends] for axis in normal.T)
+    sender, receiver = pair_rows(edges, normal.shape[0])
+    x, y, z = (axis[sender] * axis[receiver] for axis in normal.T)
     return x + y + z >= 0
 
 

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ginn_jax.hierarchy import squared_lengths
 from ginn_jax.packets import Edges
 from ginn_jax.ranges import expand_ranges
 from ginn_jax.voxels import morton_order
@@ -69,16 +70,6 @@ def tile_count(edges: int, count: Int[Array, ""]) -> Int[Array, ""]:
     """Tiles with real edges."""
     size = tile_size(edges)
     return (jnp.minimum(count, edges) + size - 1) // size
-
-
-def edge_offsets(
-    senders: Float[Array, "N 3"], receivers: Float[Array, "M 3"], edges: Edges
-) -> tuple[Float[Array, "3 E"], Bool[Array, "E"]]:
-    """x - y of every edge, zero where padded, and which edges are real."""
-    real = edges.receiver < receivers.shape[0]
-    receiver = jnp.where(real, edges.receiver, 0)
-    offset = receivers.T[:, receiver] - senders.T[:, edges.sender]
-    return jnp.where(real, offset, 0.0), real
 
 
 def kernel_inputs(
@@ -217,8 +208,8 @@ def point_area(
     over a flat surface is pi r^2 / 3. The density is of the edges that are `counted`
     and no longer than the radius.
     """
-    offset, real = edge_offsets(position, position, edges)
-    value = jnp.maximum(1 - jnp.sum(offset**2, axis=0) / radius**2, 0.0) ** 2
+    value = jnp.maximum(1 - squared_lengths(position, edges) / radius**2, 0.0) ** 2
+    real = edges.receiver < position.shape[0]
     real = real if counted is None else real & counted
     total = jax.ops.segment_sum(
         jnp.where(real, value, 0.0),
