@@ -53,7 +53,7 @@ def write_report(title: str, m: dict[str, Any]) -> str:
     return f"""# {title}
 
 Network {kind}, levels {network["levels"]}, f_2D radius {network["query"]["radius"]},
-{m["steps"]} steps of {options["batch"]} clouds, seed {options["seed"]}.
+{report.steps_taken(m)}.
 {env["processor"]}, {env["cores"]} cores, {env["devices"]} JAX devices,
 jax {env["packages"]["jax"]}, mitsuba {env["packages"]["mitsuba"]}.
 Skipped steps (non-finite gradient): {m["skipped_steps"]}. Limits raised on the way:

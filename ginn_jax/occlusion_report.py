@@ -24,8 +24,8 @@ def write_report(m: dict[str, Any]) -> str:
     return f"""# Ambient occlusion
 
 Preset {options["preset"]}, levels {m["training"]["network"]["levels"]}, f_2D radius
-{m["training"]["network"]["query"]["radius"]}, {m["steps"]} steps of
-{options["batch"]} clouds, occlusion radius {options["radius"]}, seed {options["seed"]}.
+{m["training"]["network"]["query"]["radius"]}, occlusion radius {options["radius"]},
+{report.steps_taken(m)}.
 {env["processor"]}, {env["cores"]} cores, {env["devices"]} JAX devices,
 jax {env["packages"]["jax"]}, mitsuba {env["packages"]["mitsuba"]}.
 Skipped steps (non-finite gradient): {m["skipped_steps"]}. Limits raised on the way:

@@ -142,6 +142,7 @@ def record_of(run: Path, metrics: Record, limits: Limits) -> Record:
         if key.startswith("unseen") and isinstance(value, dict)
     }
     return {
+        "start": made.get("start"),
         "training": made["training"],
         "limits": dict(limits.sizes),
         "data": made["data"],

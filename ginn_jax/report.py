@@ -74,6 +74,15 @@ def write_results(folder: Path, metrics: Mapping[str, Any], report: str) -> None
             new.write_text(content)
 
 
+def steps_taken(metrics: Mapping[str, Any]) -> str:
+    """How long a run trained, from which weights if not from new ones, and its seed."""
+    options = metrics["options"]
+    begun = options["start"]
+    trained_on = "" if begun == "None" else f" on the weights of {begun}"
+    clouds = f"{metrics['steps']} steps of {options['batch']} clouds"
+    return f"{clouds}{trained_on}, seed {options['seed']}"
+
+
 def _plain(value: Any) -> Any:
     """NumPy and JAX numbers as JSON numbers."""
     return value.tolist() if hasattr(value, "tolist") else str(value)

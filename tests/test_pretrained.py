@@ -10,7 +10,7 @@ import pytest
 import tiny
 
 from experiments.export import effect_of, fixed_scene_error
-from ginn_jax import checkpoint, fit, pretrained
+from ginn_jax import checkpoint, fit, pretrained, report
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model
 
@@ -29,7 +29,8 @@ def exported(tmp_path_factory):
     """A folder with the untrained tiny network under the name "ao"."""
     run, folder = (tmp_path_factory.mktemp(n) for n in ("run", "weights"))
     state = tiny.fresh_state()
-    checkpoint.save_run(run, tiny.CONFIG, tiny.ROOM, {"objects": [], "data": {}})
+    record = {"objects": [], "data": {}, "start": "runs/first"}
+    checkpoint.save_run(run, tiny.CONFIG, tiny.ROOM, record)
     manager = checkpoint.open_manager(run, fresh=True)
     checkpoint.save_state(manager, state)
     manager.close()
@@ -48,6 +49,16 @@ def test_weights_come_back_bit_for_bit(exported):
     assert (config, dict(limits.sizes)) == (tiny.CONFIG, dict(tiny.LIMITS.sizes))
     assert tiny.identical(weights, jax.device_get(state.variables))
     assert pretrained.load_manifest(folder)["ao"]["errors"]
+
+
+@pytest.mark.parametrize("begun", ["None", "runs/first"])
+def test_what_training_began_with_is_told(exported, begun):
+    folder, *_ = exported
+    assert pretrained.load_manifest(folder)["ao"]["start"] == "runs/first"
+    options = {"batch": "2", "seed": "1", "start": begun}
+    told = report.steps_taken({"steps": 30, "options": options})
+    assert told.startswith("30 steps of 2 clouds")
+    assert ("on the weights of runs/first" in told) == (begun == "runs/first")
 
 
 def test_unknown_names_and_damaged_files_are_told(exported, tmp_path):
