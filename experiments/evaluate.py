@@ -7,6 +7,7 @@ tracing and (where mitsuba_oidn is installed) denoised path tracing, on scenes t
 network was trained on. `--help` lists every option with its default.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +21,7 @@ from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
 from ginn_jax.compare import Picture, Shot
 from ginn_jax.compare_networks import (
+    NETWORKS,
     OURS,
     Trained,
     at_disk_radius,
@@ -116,6 +118,7 @@ def main(options: Options) -> dict[str, Any]:
     settings = compare.with_looks(settings, options.looks)
     clouds = make(console, "clouds", sources, settings, options.out / "clouds")
     at_points, networks = errors_at_points(networks, clouds, sources, settings)
+    networks |= disk_variants(networks[OURS], options.disks)
     rows, front_rows, shown = [], [], []
     for source, cloud in zip(sources, clouds, strict=True):
         console.print(f"{source.name}")
@@ -125,8 +128,8 @@ def main(options: Options) -> dict[str, Any]:
         shown.append((source.name, found[2]))
         networks = found[3]
     memory = {
-        name: network_memory(trained, count_given(settings.points))
-        for name, trained in networks.items()
+        name: network_memory(networks[name], count_given(settings.points))
+        for name in NETWORKS
     }
     at_points = {n: r | {"memory_mib": memory[n]} for n, r in at_points.items()}
     metrics = summary(options, at_points, rows, front_rows, [s.name for s in sources])
@@ -169,8 +172,9 @@ def compare_scene(
             shot, settings, options.reference, path, origin, seed=source.seed
         )
         pictures = screen_pictures(shot, camera, settings, units)
-        for name, trained in networks.items():
-            picture, networks[name] = network_picture(name, trained, given, shot)
+        for name in NETWORKS:
+            called = name, networks[name]
+            picture, networks[name] = network_picture(*called, given, shot)
             pictures.append(picture)
         rows += [p.row | {"name": source.name, "view": view} for p in pictures]
         if view == 0:
@@ -193,16 +197,14 @@ def rivals(
     units: np.ndarray | None,
 ) -> list[Row]:
     """Our network at other rates and radii, and tracing, plain and denoised."""
-    trained, rows = networks[OURS], []
+    rows = []
     for scale in options.scales:
         called = OURS + at_scale(scale), networks[OURS]
         picture, networks[OURS] = network_picture(*called, given, shot, scale)
         rows.append(picture.row)
-    for times in options.disks:
-        radius = times * trained[0].levels[0]
-        variant = at_disk_radius(trained, radius)
-        name = f"ours, disk {radius:.3g}"
-        rows.append(network_picture(name, variant, given, shot)[0].row)
+    for name in [name for name in networks if name not in NETWORKS]:
+        picture, networks[name] = network_picture(name, networks[name], given, shot)
+        rows.append(picture.row)
     ours = own, networks[OURS]
     rows.append(mean_picture(*ours, given, shot, options.draws, units).row)
     for count in options.counts:
@@ -212,6 +214,12 @@ def rivals(
         if denoised := denoised_picture(shot, noisy, units):
             rows.append(denoised.row)
     return rows
+
+
+def disk_variants(trained: Trained, disks: Sequence[float]) -> dict[str, Trained]:
+    """A network on finest levels of other Poisson disk radii, times that of its own."""
+    radii = [times * trained[0].levels[0] for times in disks]
+    return {f"{OURS}, disk {r:.3g}": at_disk_radius(trained, r) for r in radii}
 
 
 def summary(

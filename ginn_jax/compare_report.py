@@ -147,8 +147,16 @@ are kept: {", ".join(m["front_kept"])}.
 def draw_front(path: Path, rows: list[Row]) -> None:
     """Error against run time, one line a kind of method."""
     mine = [r for r in rows if r["method"].startswith(OURS)]
+    kinds = {"scale": "fewer pixels", "mean": "mean of draws"}
+    called = {kind: f"{OURS}, {name}" for kind, name in kinds.items()}
+    fresh = {
+        name: [r for r in mine if kind in r["method"] and "kept" not in r]
+        for kind, name in called.items()
+    }
+    whole = [r for r in mine if not any(kind in r["method"] for kind in kinds)]
     groups = {
-        OURS: [r for r in mine if "kept" not in r],
+        OURS: [r for r in whole if "kept" not in r],
+        **fresh,
         f"{OURS}, codes kept": [r for r in mine if "kept" in r],
         "ablations": [r for r in rows if r["method"] in ("2D only", "3D only")],
         "screen space": [

@@ -5,19 +5,16 @@ import json
 import platform
 import resource
 from collections.abc import Mapping, Sequence
-from itertools import product
 from pathlib import Path
 from typing import Any
 
 import jax
 import matplotlib
 import numpy as np
+from adjustText import adjust_text
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.text import Text
-from matplotlib.transforms import Bbox
 
 from ginn_jax.files import writing
 from ginn_jax.metrics import equal_tracing, tone_map
@@ -218,31 +215,10 @@ def draw_error_against_time(
 
 
 def label_dots(axes: Axes, dots: Sequence[tuple[str, float, float]]) -> None:
-    """Name every dot beside it, or further off on a line, clear of all others."""
+    """Name every dot, clear of the others."""
     figure: Any = axes.figure
-    renderer = FigureCanvasAgg(figure).get_renderer()
+    names = [axes.text(x, y, name, fontsize=7) for name, x, y in dots]
+    places = [dot[1] for dot in dots], [dot[2] for dot in dots]
     figure.draw_without_rendering()  # places are known once the layout is
-    ends = axes.transData.transform([dot[1:] for dot in dots])
-    taken = [Bbox.from_bounds(x - 4, y - 4, 8, 8) for x, y in ends]
-    for number, (name, x, y) in enumerate(dots):
-        box, others = taken[number], taken[:number] + taken[number + 1 :]
-        for reach, angle in product((6, 14, 22, 32, 46), range(20, 380, 20)):
-            away = reach * np.cos(np.radians(angle)), reach * np.sin(np.radians(angle))
-            label = axes.annotate(
-                name,
-                (x, y),
-                fontsize=7,
-                xytext=away,
-                textcoords="offset points",
-                ha="left" if away[0] > 0 else "right",
-                va="center",
-                arrowprops={"arrowstyle": "-", "lw": 0.4} if reach > 6 else None,
-            )
-            label.set_in_layout(False)
-            label.update_positions(renderer)
-            box = Text.get_window_extent(label, renderer)
-            inside = axes.bbox.x0 < box.x0 and box.x1 < axes.bbox.x1
-            if inside and not box.count_overlaps(others):
-                break
-            label.remove()
-        taken.append(box)
+    line = {"arrowstyle": "-", "lw": 0.4}
+    adjust_text(names, *places, ax=axes, expand=(1.15, 1.3), arrowprops=line)
