@@ -143,7 +143,12 @@ _DIFFUSE = compact_network(
 
 # Most media are dense: light leaves them near to where it entered.
 _DENSE = compact_network(
-    levels=(0.015, 0.04, 0.1, 0.2), query_radius=0.0275, sided=True, smooth=0.01, **_FAR
+    levels=(0.015, 0.04, 0.1, 0.2),
+    query_radius=0.0275,
+    sided=True,
+    smooth=0.01,
+    taper=0.4,
+    **_FAR,
 )
 
 
