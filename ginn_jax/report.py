@@ -15,6 +15,7 @@ from adjustText import adjust_text
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from ginn_jax.files import writing
 from ginn_jax.metrics import equal_tracing, tone_map
@@ -208,6 +209,11 @@ def draw_error_against_time(
         names = [row["method"] for row in ordered]
         dots += zip(names, seconds, errors, strict=True)
     axes.set(xlabel="ms per image", ylabel="2D MSE", xscale="log", yscale="log")
+    axes.xaxis.set(
+        major_locator=LogLocator(subs=(1, 2, 5)),
+        major_formatter="{x:g}",
+        minor_formatter=NullFormatter(),
+    )
     axes.grid(alpha=0.3)
     figure.legend(loc="outside upper center", ncols=3, fontsize=8)
     label_dots(axes, dots)
