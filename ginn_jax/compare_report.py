@@ -147,16 +147,13 @@ are kept: {", ".join(m["front_kept"])}.
 def draw_front(path: Path, rows: list[Row]) -> None:
     """Error against run time, one line a kind of method."""
     mine = [r for r in rows if r["method"].startswith(OURS)]
-    kinds = {"scale": "fewer pixels", "mean": "mean of draws"}
-    called = {kind: f"{OURS}, {name}" for kind, name in kinds.items()}
-    fresh = {
-        name: [r for r in mine if kind in r["method"] and "kept" not in r]
-        for kind, name in called.items()
-    }
-    whole = [r for r in mine if not any(kind in r["method"] for kind in kinds)]
+    fresh = [r for r in mine if "kept" not in r]
+    rates = [r for r in fresh if "scale" in r["method"]]
+    means = [r for r in fresh if "mean" in r["method"]]
     groups = {
-        OURS: [r for r in whole if "kept" not in r],
-        **fresh,
+        OURS: [r for r in fresh if r not in rates + means],
+        f"{OURS}, fewer pixels": rates,
+        f"{OURS}, mean of draws": means,
         f"{OURS}, codes kept": [r for r in mine if "kept" in r],
         "ablations": [r for r in rows if r["method"] in ("2D only", "3D only")],
         "screen space": [
