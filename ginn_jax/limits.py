@@ -170,20 +170,36 @@ def measure_demands(
 ) -> list[dict[str, int]]:
     """Host: the demands of `count` probes.
 
-    `probe(limits, i)` builds the geometry of example i. `limits` should be generous:
-    the first `FEW` examples are probed with them, any others with `AMPLE` times what
-    those needed at the most. Every limit that is raised costs a compilation.
+    `probe(limits, i)` builds the geometry of example i. `limits` should be generous,
+    and name stages in the order in which they build on each other: the first `FEW`
+    examples are probed with them, any others with `AMPLE` times what those needed at
+    the most. Every limit that is raised costs a compilation.
     """
     found: list[dict[str, int]] = []
+    order = [name for name, _ in limits.sizes]
     for i in range(count):
         demands = probe(limits, i)
         while short := exceeded(limits, demands):
-            limits = raise_limits(limits, short, 2.0)
+            limits = raise_limits(limits, first_stage(short, order), 2.0)
             demands = probe(limits, i)
         found.append({name: int(np.max(demand)) for name, demand in demands.items()})
         if len(found) == FEW < count:
             limits = limits_for(suffices_for(1.0, found), AMPLE)
     return found
+
+
+def first_stage(short: dict[str, int], order: Sequence[str]) -> dict[str, int]:
+    """Those of the first search, or the first level's points, that lacked room.
+
+    What later stages say they need means nothing yet: a Poisson disk that misses edges
+    keeps too many points.
+    """
+
+    def stage(name: str) -> str:
+        return name if name.endswith(".points") else name.rpartition(".")[0]
+
+    first = stage(next(name for name in order if name in short))
+    return {name: need for name, need in short.items() if stage(name) == first}
 
 
 def limits_for(demands: dict[str, int], slack: float) -> Limits:

@@ -39,20 +39,23 @@ def search_demands(name: str, demand: Demand) -> Demands:
 
 
 def limit_names(network: Network) -> tuple[str, ...]:
-    """The name of every capacity of a network."""
-    names = []
-    for i in range(len(network.levels)):
-        own = () if shared_search(network, i) else Demand._fields
-        names += [f"level_{i}.{part}" for part in (*own, "points")]
+    """The name of every capacity of a network, as its searches build on each other."""
+    names: list[str] = []
+    shared = [shared_search(network, i) for i in range(len(network.levels))]
+    for i, conv in enumerate(shared):
+        names += _search_names(f"level_{i}" if conv is None else conv.name)
+        names.append(f"level_{i}.points")
+    own = [c for c in network.encoder if not (c in shared or transposed(network, c))]
     more = [area_search(network)] if needs_areas(network) else []
-    for conv in (*more, *facet_searches(network)):
-        names += [f"{conv.name}.{part}" for part in Demand._fields]
-    for conv in (*network.encoder, network.query):
-        if conv is not network.query and transposed(network, conv):
-            continue
-        names += [f"{conv.name}.{part}" for part in Demand._fields]
-        names += [f"{conv.name}.pairs"] if network.density == "kde" else []
+    for conv in (*facet_searches(network), *own, *more, network.query):
+        names += _search_names(conv.name)
+    if network.density == "kde":
+        names += [f"{conv.name}.pairs" for conv in (*network.encoder, network.query)]
     return tuple(names)
+
+
+def _search_names(name: str) -> list[str]:
+    return [f"{name}.{part}" for part in Demand._fields]
 
 
 def shared_search(network: Network, level: int) -> Conv | None:

@@ -3,7 +3,16 @@
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from small_sphere import CLOUD, QUERIES, SHALLOW, as_jax, as_numpy, demands_of, generous
+from small_sphere import (
+    CLOUD,
+    NETWORKS,
+    QUERIES,
+    SHALLOW,
+    as_jax,
+    as_numpy,
+    demands_of,
+    generous,
+)
 
 from ginn_jax import limits as lm
 from ginn_jax import searches as se
@@ -61,6 +70,35 @@ def test_measured_limits_fit(start, sizes):
         assert len(shapes) == (1 if len(sizes) <= lm.FEW else 2)
     for i in range(len(sizes)):
         assert lm.exceeded(limits, probe(limits, i)) == {}
+
+
+def test_what_an_overflow_garbles_is_not_made_room_for():
+    need = {"a.edges": 5000, "a.points": 90, "b.edges": 300}
+    garbled = need | {"a.points": 10**6, "b.edges": 10**9}
+    tried = []
+
+    def probe(limits, _):
+        tried.append(limits)
+        return as_jax(need if limits.of("a.edges") >= 5000 else garbled)
+
+    first = lm.Limits((("a.edges", 100), ("a.points", 50), ("b.edges", 200)))
+    found = lm.measure_limits(first, probe, 1, slack=1.0)
+    assert lm.exceeded(found, as_jax(need)) == {}
+    assert [tried[-1].of(n) < 3 * need[n] for n in need] == [True] * 3
+
+
+@pytest.mark.parametrize("name", ["level_0.edges", "conv_0.edges", "level_1.points"])
+def test_limits_are_named_in_the_order_of_the_pipeline(name):
+    """What lacks room changes nothing of what comes before."""
+    network = NETWORKS["surface"]
+    ample = generous(network)
+    true = as_numpy(demands_of(network, ample, "", CLOUD, QUERIES))
+    sizes = dict(ample.sizes) | {name: int(true[name]) // 2}
+    short = lm.Limits(tuple(sizes.items()))
+    found = as_numpy(demands_of(network, short, "", CLOUD, QUERIES))
+    order = se.limit_names(network)
+    changed = [order.index(n) for n in order if found[n] != true[n]]
+    assert changed and min(changed) > order.index(name)
 
 
 def demands_by_hand(size, limits):
