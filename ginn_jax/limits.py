@@ -176,6 +176,7 @@ def measure_demands(
     the most. Every limit that is raised costs a compilation.
     """
     found: list[dict[str, int]] = []
+    # Kept, for demands come back from jit sorted by name, and so do limits of them.
     order = [name for name, _ in limits.sizes]
     for i in range(count):
         demands = probe(limits, i)

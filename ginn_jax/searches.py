@@ -28,14 +28,19 @@ def search(
     return edges, search_demands(conv.name, edges.demand)
 
 
+def search_names(name: str) -> list[str]:
+    """The names of the capacities of one search, in the order of `Demand`."""
+    return [f"{name}.{part}" for part in Demand._fields]
+
+
 def search_limit(limits: Limits, name: str) -> EdgeLimit:
     """The capacities of the search of that name."""
-    return EdgeLimit(*(limits.of(f"{name}.{part}") for part in Demand._fields))
+    return EdgeLimit(*map(limits.of, search_names(name)))
 
 
 def search_demands(name: str, demand: Demand) -> Demands:
     """What that search needed, under the names of its capacities."""
-    return {f"{name}.{part}": n for part, n in demand._asdict().items()}
+    return dict(zip(search_names(name), demand, strict=True))
 
 
 def limit_names(network: Network) -> tuple[str, ...]:
@@ -43,19 +48,15 @@ def limit_names(network: Network) -> tuple[str, ...]:
     names: list[str] = []
     shared = [shared_search(network, i) for i in range(len(network.levels))]
     for i, conv in enumerate(shared):
-        names += _search_names(f"level_{i}" if conv is None else conv.name)
+        names += search_names(f"level_{i}" if conv is None else conv.name)
         names.append(f"level_{i}.points")
     own = [c for c in network.encoder if not (c in shared or transposed(network, c))]
     more = [area_search(network)] if needs_areas(network) else []
     for conv in (*facet_searches(network), *own, *more, network.query):
-        names += _search_names(conv.name)
+        names += search_names(conv.name)
     if network.density == "kde":
         names += [f"{conv.name}.pairs" for conv in (*network.encoder, network.query)]
     return tuple(names)
-
-
-def _search_names(name: str) -> list[str]:
-    return [f"{name}.{part}" for part in Demand._fields]
 
 
 def shared_search(network: Network, level: int) -> Conv | None:
