@@ -169,8 +169,8 @@ def block_memory(
     zeros = np.zeros((rows, 3), np.float32)
     queries = Oriented(zeros, zeros, np.ones(rows, bool))
     flat = inference.only(limits, network.query.name)
-    arrays = network, flat, variables, encoded, queries
-    lowered = inference.shade_block.lower(*arrays, coherent=True)
+    turn = blocks.turn_shapes(blocks.Turn(queries))
+    lowered = inference.shade_turn.lower(network, flat, True, variables, encoded, turn)
     memory = lowered.compile().memory_analysis()
     return int(memory.temp_size_in_bytes) if memory else 0
 

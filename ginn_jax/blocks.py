@@ -1,11 +1,16 @@
 """Points on the host made ready for compiled functions: padded, in blocks.
 
 Few shapes, so few compilations: clouds are padded to the next bucket, queries come in
-blocks, of which all devices have about as many to do.
+turns of a block for every device, and one program serves all devices.
 """
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
+from jax.sharding import Mesh as DeviceMesh
+from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Float
 
 from ginn_jax.dataset import relative_to
@@ -13,6 +18,17 @@ from ginn_jax.neighbors import bucket, pad_rows
 from ginn_jax.receptive_field import Oriented
 
 BLOCK = 1 << 15
+
+_EACH = "device"
+Shared = TypeVar("Shared")
+
+
+class Turn(NamedTuple):
+    """A block of queries for every device, with what the network asks of them."""
+
+    queries: Oriented
+    material: Float[Any, "D C R A"] | None = None
+    light: Float[Any, "D C R L"] | None = None
 
 
 def largest_block(lit: bool) -> int:
@@ -48,13 +64,71 @@ def pad_channels(
     return np.pad(np.asarray(numbers, np.float32), padding)
 
 
-def in_blocks(
+def in_turns(
     center: Float[np.ndarray, "3"] | None,
     position: Float[np.ndarray, "M 3"],
     normal: Float[np.ndarray, "M 3"],
     size: int,
 ) -> list[Oriented]:
-    """Points counted from `center`, so many at a time; the last block is padded."""
-    rows = -(-len(position) // size) * size
-    points = pad_points(center, position, normal, rows)
-    return [Oriented(*(a[i : i + size] for a in points)) for i in range(0, rows, size)]
+    """Points counted from `center`, in turns of a block of `size` for every device.
+
+    Arrays of a turn are [D size ...] for D devices; the last turn is padded.
+    """
+    each = jax.device_count() * size
+    turns = -(-len(position) // each)
+    points = pad_points(center, position, normal, turns * each)
+    shape = turns, jax.device_count(), size
+    blocks = Oriented(*(a.reshape(*shape, *a.shape[1:]) for a in points))
+    return [Oriented(*(a[turn] for a in blocks)) for turn in range(turns)]
+
+
+def channels_in_turns(
+    numbers: Float[np.ndarray, "C M A"] | None, size: int, turns: int
+) -> Sequence[Float[np.ndarray, "D C size A"] | None]:
+    """What comes with the points of as many turns; the last is padded."""
+    shape = turns, jax.device_count(), size
+    if numbers is None:
+        return [None] * turns
+    padded = np.asarray(pad_channels(numbers, int(np.prod(shape))))
+    split = padded.reshape(len(numbers), *shape, numbers.shape[2])
+    return list(np.moveaxis(split, 0, 2))
+
+
+def in_rows(turns: Sequence[Any]) -> Float[np.ndarray, "M *C"]:
+    """Values [D *C size] of all turns as those of points, one after the other."""
+    rows = [np.moveaxis(np.asarray(turn), -1, 1) for turn in turns]
+    return np.concatenate([turn.reshape(-1, *turn.shape[2:]) for turn in rows])
+
+
+def turn_shapes(block: Any) -> Any:
+    """Shapes and types of a turn of such blocks."""
+    count = jax.device_count()
+    return jax.tree.map(
+        lambda a: jax.ShapeDtypeStruct((count, *a.shape), a.dtype), block
+    )
+
+
+def everywhere(arrays: Shared) -> Shared:
+    """Copies on every device: what all blocks are given."""
+    return jax.device_put(arrays, NamedSharding(_device_mesh(), PartitionSpec()))
+
+
+def for_each_block(function: Callable[[Any, Any], Any], shared: Any, turn: Any) -> Any:
+    """`function(shared, block)` for the blocks of a turn, one on every device.
+
+    What is made of them has their first axis. One program, compiled once: jit alone
+    compiles for every device by itself.
+    """
+
+    def own(shared: Any, turn: Any) -> Any:
+        made = function(shared, jax.tree.map(lambda a: a[0], turn))
+        return jax.tree.map(lambda a: a[None], made)
+
+    each = PartitionSpec(_EACH)
+    specs = {"in_specs": (PartitionSpec(), each), "out_specs": each}
+    mesh = _device_mesh()
+    return jax.shard_map(own, mesh=mesh, **specs, check_vma=False)(shared, turn)
+
+
+def _device_mesh() -> DeviceMesh:
+    return DeviceMesh(np.array(jax.devices()), (_EACH,))

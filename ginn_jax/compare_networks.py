@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Key
 
 from ginn_jax import evaluate, evaluate_light
 from ginn_jax.architecture import Network
-from ginn_jax.blocks import largest_block
+from ginn_jax.blocks import Turn, largest_block, turn_shapes
 from ginn_jax.checkpoint import RECORD, damaged, read_record
 from ginn_jax.compare import Picture, Shot, errors, of_variance, scratch_mib
 from ginn_jax.dataset import ShadedPoints, count_given
@@ -21,7 +21,7 @@ from ginn_jax.evaluate import Model, Row, View
 from ginn_jax.inference import (
     encode_whole,
     only,
-    shade_block,
+    shade_turn,
     without,
 )
 from ginn_jax.limits import Limits
@@ -198,9 +198,9 @@ def network_memory(trained: Trained, points: int) -> float:
     compiled = encode_whole.lower(*deep, *given).compile()
     encoded, _ = jax.eval_shape(partial(encode_whole, *deep), *given)
     kept = sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(encoded.code))
-    flat = network, only(limits, network.query.name), model.variables
+    flat = network, only(limits, network.query.name), True, model.variables
     rows = largest_block(encoded.scale is not None)
-    block = shapes(rows, network.asks == "all")
-    shaded = shade_block.lower(*flat, encoded, *block, coherent=True).compile()
+    turn = turn_shapes(Turn(*shapes(rows, network.asks == "all")))
+    shaded = shade_turn.lower(*flat, encoded, turn).compile()
     blocks = len(jax.devices()) * scratch_mib(shaded)
     return max(scratch_mib(compiled), blocks) + kept / 2**20

@@ -14,8 +14,13 @@ from jaxtyping import Array, Bool, Float, Key
 
 from ginn_jax.architecture import Network
 from ginn_jax.blocks import (
+    Turn,
     block_size,
-    in_blocks,
+    channels_in_turns,
+    everywhere,
+    for_each_block,
+    in_rows,
+    in_turns,
     largest_block,
     pad_channels,
     pad_points,
@@ -48,13 +53,37 @@ from ginn_jax.shading import (
 )
 
 encode_whole = jax.jit(encode, static_argnums=(0, 1))
-shade_block = jax.jit(
-    shade, static_argnums=(0, 1), static_argnames="coherent", compiler_options=ALONE
-)
 _cloud_demands = jax.jit(cloud_demands, static_argnums=(0, 1))
-_query_demands = jax.jit(
-    query_demands, static_argnums=(0, 1), static_argnames="coherent"
-)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=ALONE)
+def shade_turn(
+    network: Network,
+    limits: Limits,
+    coherent: bool,
+    variables: Variables,
+    encoded: Encoded,
+    turn: Turn,
+) -> tuple[Float[Array, "D *C R"], Demands]:
+    """`shade` for a block of queries on every device."""
+
+    def shade_block(shared: Any, block: Any) -> tuple[Array, Demands]:
+        return shade(network, limits, *shared, *block, coherent=coherent)
+
+    return for_each_block(shade_block, (variables, encoded), turn)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=ALONE)
+def _query_demands(
+    network: Network,
+    limits: Limits,
+    coherent: bool,
+    searched: Searched,
+    turn: Oriented,
+) -> Demands:
+    """`query_demands` of a block of queries on every device."""
+    measure = partial(query_demands, network, limits, coherent=coherent)
+    return for_each_block(measure, searched, turn)
 
 
 def encode_cloud(
@@ -139,17 +168,18 @@ def cloud_limits(
 def query_limits(
     network: Network,
     searched: Searched,
-    blocks: Sequence[Oriented],
+    turns: Sequence[Oriented],
     coherent: bool = False,
 ) -> Limits:
     """Limits that hold what f_2D of each block needs, measured with ample ones."""
-    ample = uniform_limits(network, 16 * blocks[0].mask.shape[0])
+    ample = uniform_limits(network, 16 * turns[0].mask.shape[1])
+    searched = everywhere(searched)
 
     def probe(limits: Limits, number: int) -> Demands:
-        given = network, limits, searched, blocks[number]
-        return jax.device_get(_query_demands(*given, coherent=coherent))
+        given = network, limits, coherent, searched, turns[number]
+        return jax.device_get(_query_demands(*given))
 
-    return measure_limits(only(ample, network.query.name), probe, len(blocks), SLACK)
+    return measure_limits(only(ample, network.query.name), probe, len(turns), SLACK)
 
 
 def check_numbers(name: str, numbers: Any, width: int, rows: int) -> None:
@@ -174,29 +204,19 @@ def without(limits: Limits, conv: str) -> Limits:
     return Limits(tuple(s for s in limits.sizes if not s[0].startswith(f"{conv}.")))
 
 
-def _shade_blocks(
+def _shade_turns(
     network: Network,
     variables: Variables,
     encoded: Encoded,
-    blocks: Sequence[Oriented],
-    numbers: tuple[Float[np.ndarray, "C R _"] | None, ...],
+    turns: Sequence[Turn],
     coherent: bool,
     limits: Limits,
 ) -> tuple[list[Array], list[Demands]]:
-    """Values of every block, which take turns on all devices, and their demands."""
+    """Values of the blocks of every turn, and their demands."""
     needed = {"shader": variables["shader"]}, encoded._replace(center=None, kept=None)
-    copies = [jax.device_put(needed, device) for device in jax.devices()]
-    flat = only(limits, network.query.name)
-    parts, demands = [], []
-    for turn, queries in enumerate(blocks):
-        size = len(queries.mask)
-        rows = slice(turn * size, (turn + 1) * size)
-        own = (None if a is None else a[:, rows] for a in numbers)
-        ends = *copies[turn % len(copies)], queries
-        values, demand = shade_block(network, flat, *ends, *own, coherent=coherent)
-        parts.append(values)
-        demands.append(demand)
-    return parts, demands
+    given = network, only(limits, network.query.name), coherent, *everywhere(needed)
+    made = [shade_turn(*given, turn) for turn in turns]
+    return [values for values, _ in made], [demands for _, demands in made]
 
 
 def shade_points(
@@ -224,17 +244,17 @@ def shade_points(
         check_numbers("material", material, network.materials, len(position))
         check_numbers("light", light, network.lights, len(position))
     size = block_size(len(position), encoded.scale is not None)
-    blocks = in_blocks(encoded.center, position, normal, size)
+    queries = in_turns(encoded.center, position, normal, size)
     asked = numbers_asked(network, material, light)
-    numbers = tuple(pad_channels(a, len(blocks) * size) for a in asked)
-    ends = network, variables, encoded, blocks, numbers, coherent
-    attempt = partial(_shade_blocks, *ends)
-    measure = partial(query_limits, network, encoded.searched(), blocks, coherent)
+    numbers = (channels_in_turns(a, size, len(queries)) for a in asked)
+    turns = list(map(Turn, queries, *numbers))
+    attempt = partial(_shade_turns, network, variables, encoded, turns, coherent)
+    measure = partial(query_limits, network, encoded.searched(), queries, coherent)
     parts, sufficed, demands = with_room(limits, attempt, measure)
     if 2 * size > largest_block(encoded.scale is not None):  # the next may be larger
         sufficed = fitted(sufficed, demands)
     say_raised(limits, sufficed)
     channels = () if encoded.scale is None else encoded.scale.shape
-    values = [np.zeros((0, *channels), np.float32)]
-    values += [np.moveaxis(np.asarray(part), -1, 0) for part in parts]
-    return np.concatenate(values)[: len(position)], sufficed
+    if not parts:
+        return np.zeros((0, *channels), np.float32), sufficed
+    return in_rows(parts)[: len(position)], sufficed

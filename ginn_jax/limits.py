@@ -19,7 +19,8 @@ from ginn_jax.errors import InputError
 from ginn_jax.process import spare_memory_maps
 
 LOG = logging.getLogger("ginn_jax")
-Demands = dict[str, Int[Any, ""]]
+# What each capacity needs: a number, or one for every device.
+Demands = dict[str, Int[Any, "..."]]
 Made = TypeVar("Made")
 # What is made room for beyond what was needed.
 SLACK = 1.25

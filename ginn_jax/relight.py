@@ -12,7 +12,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ginn_jax.architecture import Network
-from ginn_jax.blocks import block_size, in_blocks, pad_channels, pad_points
+from ginn_jax.blocks import (
+    block_size,
+    channels_in_turns,
+    everywhere,
+    for_each_block,
+    in_rows,
+    in_turns,
+    pad_channels,
+    pad_points,
+)
 from ginn_jax.checks import unit_rows
 from ginn_jax.dataset import center_of
 from ginn_jax.geometry import Geometry, build_geometry
@@ -50,10 +59,10 @@ class QueryPlan(NamedTuple):
 
 
 class Relightable(NamedTuple):
-    """A cloud and queries, ready for any light; the blocks lie on all devices."""
+    """A cloud and queries, ready for any light; a turn has a block on every device."""
 
     scene: ScenePlan
-    blocks: tuple[QueryPlan, ...]
+    turns: tuple[QueryPlan, ...]
 
 
 def plan_scene(
@@ -124,9 +133,31 @@ def shade_planned(
 
 
 _plan_scene = jax.jit(plan_scene, static_argnums=(0, 1))
-_plan_queries = jax.jit(plan_queries, static_argnums=(0, 1))
 _encode_planned = jax.jit(encode_planned, static_argnums=0)
-_shade_planned = jax.jit(shade_planned, static_argnums=0, compiler_options=ALONE)
+
+
+@partial(jax.jit, static_argnums=(0, 1), compiler_options=ALONE)
+def _plan_turn(
+    network: Network, limits: Limits, shared: Any, turn: Oriented
+) -> tuple[QueryPlan, Demands]:
+    """`plan_queries` of a block on every device; `shared`: weights, what to search."""
+
+    def plan(shared: Any, block: Oriented) -> tuple[QueryPlan, Demands]:
+        variables, searched = shared
+        return plan_queries(network, limits, variables, searched, block)
+
+    return for_each_block(plan, shared, turn)
+
+
+@partial(jax.jit, static_argnums=0, compiler_options=ALONE)
+def _shade_turn(network: Network, shared: Any, turn: Any) -> Float[Array, "D C R"]:
+    """`shade_planned` of a block on every device; `shared`: weights, codes, light."""
+
+    def shade(shared: Any, block: Any) -> Float[Array, "C R"]:
+        (variables, lit), (plan, *numbers) = shared, block
+        return shade_planned(network, variables, plan, *lit, *numbers)
+
+    return for_each_block(shade, shared, turn)
 
 
 def prepare_relighting(
@@ -148,7 +179,7 @@ def prepare_relighting(
     rows = bucket(len(cloud.position))
     points = pad_points(center, cloud.position, cloud.normal, rows)
     size = block_size(len(queries.position), lit=True)
-    blocks = in_blocks(center, queries.position, queries.normal, size)
+    turns = in_turns(center, queries.position, queries.normal, size)
 
     def plan_points(limits: Limits) -> tuple[ScenePlan, list[Demands]]:
         deep = without(limits, network.query.name)
@@ -160,19 +191,15 @@ def prepare_relighting(
 
     geometry = scene.geometry
     searched = geometry.levels[0], geometry.grid, geometry.area, geometry.around
+    shared = everywhere((variables, searched))
 
-    def plan_blocks(limits: Limits) -> tuple[list[QueryPlan], list[Demands]]:
+    def plan_turns(limits: Limits) -> tuple[list[QueryPlan], list[Demands]]:
         flat = only(limits, network.query.name)
-        plans, demands = [], []
-        for number, block in enumerate(blocks):
-            plan, demand = _plan_queries(network, flat, variables, searched, block)
-            device = jax.devices()[number % len(jax.devices())]
-            plans.append(jax.device_put(plan, device))
-            demands.append(demand)
-        return plans, demands
+        made = [_plan_turn(network, flat, shared, turn) for turn in turns]
+        return [plan for plan, _ in made], [demands for _, demands in made]
 
-    measure = partial(query_limits, network, searched, blocks)
-    plans, sufficed = in_fitting_room(sufficed, plan_blocks, measure)
+    measure = partial(query_limits, network, searched, turns)
+    plans, sufficed = in_fitting_room(sufficed, plan_turns, measure)
     say_raised(limits, sufficed)
     return Relightable(scene, tuple(plans)), sufficed
 
@@ -191,14 +218,10 @@ def relight(
     rows = bucket(len(cloud.position))
     numbers = (pad_channels(a, rows) for a in network_numbers(cloud))
     lit = _encode_planned(network, variables, ready.scene, *numbers)
-    needed = {"shader": variables["shader"]}, lit
-    copies = [jax.device_put(needed, device) for device in jax.devices()]
-    size, parts = block_size(len(queries.position), lit=True), []
+    shared = everywhere(({"shader": variables["shader"]}, lit))
+    size = block_size(len(queries.position), lit=True)
     asked = network_numbers(queries) if network.asks == "all" else (None, None)
-    for number, plan in enumerate(ready.blocks):
-        part = slice(number * size, (number + 1) * size)
-        own = (None if a is None else pad_channels(a[:, part], size) for a in asked)
-        weights, codes = copies[number % len(copies)]
-        parts.append(_shade_planned(network, weights, plan, *codes, *own))
-    values = np.concatenate([np.asarray(part) for part in parts], axis=1)
-    return np.maximum(values[:, : len(queries.position)].T, 0.0)
+    own = (channels_in_turns(a, size, len(ready.turns)) for a in asked)
+    turns = zip(ready.turns, *own, strict=True)
+    values = in_rows([_shade_turn(network, shared, turn) for turn in turns])
+    return np.maximum(values[: len(queries.position)], 0.0)

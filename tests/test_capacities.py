@@ -152,7 +152,7 @@ def counted(monkeypatch, name):
 
     def called(*args, **options):
         result = function(*args, **options)
-        calls.append({n: int(d) for n, d in jax.device_get(result[1]).items()})
+        calls.append({n: int(np.max(d)) for n, d in result[1].items()})
         return result
 
     monkeypatch.setattr(inference, name, called)
@@ -168,7 +168,7 @@ def test_host_calls_find_room_and_drop_nothing(monkeypatch, caplog):
     ends = cloud.position, cloud.normal
     deep, flat = (
         counted(monkeypatch, "encode_whole"),
-        counted(monkeypatch, "shade_block"),
+        counted(monkeypatch, "shade_turn"),
     )
 
     def run(limits):

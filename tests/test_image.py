@@ -184,13 +184,13 @@ def test_points_in_order_need_no_sorting(variables, encoded, values):
 def test_number_of_blocks_is_that_of_the_foreground(
     variables, encoded, values, monkeypatch
 ):
-    calls, shade_block = [], inference.shade_block
+    calls, shade_turn = [], inference.shade_turn
 
-    def counted(*arguments, **options):
-        calls.append(int(arguments[4].mask.sum()))
-        return shade_block(*arguments, **options)
+    def counted(*arguments):
+        calls.append(int(arguments[5][0].mask.sum()))
+        return shade_turn(*arguments)
 
-    monkeypatch.setattr(inference, "shade_block", counted)
+    monkeypatch.setattr(inference, "shade_turn", counted)
     mask = np.arange(24 * 25).reshape(24, 25) >= 300
     arguments = (tiny.NETWORK, tiny.LIMITS, variables, encoded)
     image.shade_image(*arguments, *picture(mask), mask)

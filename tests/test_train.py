@@ -1,11 +1,7 @@
 """One tiny scene is learned, by the one step that is compiled for all of this file."""
 
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +9,7 @@ import numpy as np
 import optax
 import pytest
 import tiny
+import two_devices
 
 from ginn_jax import example, objective, train
 from ginn_jax.geometry import Geometry
@@ -148,13 +145,9 @@ def test_loss_is_the_mean_square_error():
 
 
 TWO_DEVICES = """
-import jax
 import numpy as np
 from dataclasses import replace
-from functools import partial
-from ginn_jax import process, train
-process.tune_process(2)
-assert len(jax.devices()) == 2
+from ginn_jax import train
 assert train.batch_mesh(2).size == train.batch_mesh(4).size == 2
 assert train.batch_mesh(3).size == 1
 import test_train, tiny
@@ -173,25 +166,11 @@ assert state.skipped == 1 and state.step == 3
 crowded = data.position * np.float32([[[1]], [[0.2]]])
 state, report = tiny.step(state, data._replace(position=crowded), config, limits)
 assert not report.fits and state.step == 3
-print("two devices agree")
 """
 
 
 def test_batch_is_shared_between_devices():
-    here = Path(__file__).parent
-    paths = os.pathsep.join(
-        [str(here), str(here.parent), os.environ.get("PYTHONPATH", "")]
-    )
-    more = {"PYTHONPATH": paths, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", TWO_DEVICES],
-        env=os.environ | more,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert done.stdout == "two devices agree\n", done.stderr[-2000:]
+    two_devices.check(TWO_DEVICES)
 
 
 def rates(config, steps):
