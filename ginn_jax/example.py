@@ -1,7 +1,7 @@
 """What a training step computes from its clouds before any parameter enters.
 
-Clouds are turned, thinned by Poisson disk sampling and searched; the points that
-thinning leaves over are asked for their shading and carry the loss.
+Clouds are turned, thinned at random and by Poisson disk sampling, and searched; the
+points that thinning leaves over are asked for their shading and carry the loss.
 """
 
 from typing import Any, NamedTuple
@@ -55,12 +55,17 @@ def thin_and_search(
     batch: ShadedPoints,
     points: int,
     queries: int,
+    sparsest: float,
     *,
     key: Key[Array, ""],
 ) -> tuple[Example, Demands]:
-    """Turn, thin and search a batch [B, N], of whose clouds `points` are taken."""
+    """Turn, thin and search a batch [B, N], of whose clouds `points` are taken.
+
+    The network is given a share of those, between `sparsest` and all; it is asked for
+    others.
+    """
     clouds = batch.position.shape[0]
-    turn_key, window_key, disk_key = jax.random.split(key, 3)
+    turn_key, window_key, share_key, disk_key = jax.random.split(key, 4)
     window = jax.random.randint(window_key, (), 0, batch.position.shape[1], jnp.int32)
     batch = jax.tree.map(lambda a: jnp.roll(a, -window, axis=1)[:, :points], batch)
     turn_keys = jax.random.split(turn_key, clouds)
@@ -69,7 +74,8 @@ def thin_and_search(
     mask = jnp.ones(cloud.target.shape, bool)
     order = morton_order(cloud.position, mask)
     cloud = jax.tree.map(lambda a: a[order], cloud)
-    geometry, demands = build_geometry(network, limits, oriented(cloud), key=disk_key)
+    known = oriented(cloud)._replace(mask=given_share(mask, sparsest, key=share_key))
+    geometry, demands = build_geometry(network, limits, known, key=disk_key)
     rows, real = left_over(geometry, mask, clouds * queries)
     asking = Oriented(cloud.position[rows], cloud.normal[rows], real)
     asking, facets, near = smooth_queries(network, limits, geometry.around, asking)
@@ -80,6 +86,21 @@ def thin_and_search(
     asked = queries_asked(network, asking, *numbers(cloud, rows, real, facets))
     example = Example(geometry, given, field, asking, asked, cloud.target[rows])
     return example, demands | near | more
+
+
+def given_share(
+    mask: Bool[Array, "N"], sparsest: float, *, key: Key[Array, ""]
+) -> Bool[Array, "N"]:
+    """A share of the points drawn evenly between `sparsest` and all of them.
+
+    Of clouds that are always as dense a network learns nothing of others; and of all
+    that a Poisson disk drops some point that it keeps is near.
+    """
+    if sparsest == 1.0:
+        return mask
+    share_key, point_key = jax.random.split(key)
+    share = jax.random.uniform(share_key, minval=sparsest)
+    return mask & (jax.random.uniform(point_key, mask.shape) < share)
 
 
 def in_unit_light(cloud: ShadedPoints) -> ShadedPoints:

@@ -17,6 +17,7 @@ from rich.progress import (
 
 from ginn_jax import fit, report, scenes
 from ginn_jax.architecture import Network
+from ginn_jax.checks import positive
 from ginn_jax.commandline import require, require_positive
 from ginn_jax.dataset import count_asked, count_given
 from ginn_jax.errors import InputError
@@ -44,6 +45,8 @@ class RunOptions:
     """A mesh file or a folder of unseen meshes to evaluate on as well."""
     points: int = 20_000
     """Samples per object."""
+    sparsest: float = 1.0
+    """Each step gives the network a share of its samples between this and all."""
     schedule: Literal["cosine", "paper"] = "cosine"
     """Muon with warm-up and cosine decay, or the paper's Adam, x0.7 every 10 epochs."""
     steps: int = 3000
@@ -72,6 +75,7 @@ def check_run(options: RunOptions, least: dict[str, int]) -> None:
     require(options, bounds | {"resolution": 32, "seed": 0} | least)
     shading_step(options.resolution_scale)
     require_positive(options, "learning_rate")
+    positive("--sparsest", options.sparsest, 1.0)
     if options.start is not None:
         load_any(options.start)  # a name that is wrong is said before data are made
     if max(options.shapes, 30) + options.seed * SEEDS_APART > UNSEEN_SEED:
@@ -166,6 +170,7 @@ def training(
         batch_size=options.batch,
         points=count_given(points),
         queries=count_asked(points),
+        sparsest=options.sparsest,
         learning_rate=options.learning_rate,
         schedule=options.schedule,
         epoch_steps=max(clouds // options.batch, 1),

@@ -31,8 +31,9 @@ from ginn_jax.searches import uniform_limits
 class Training:
     """How to train.
 
-    `points` of every cloud are taken for a step, `queries` of those that Poisson disk
-    sampling leaves over carry the loss. Schedule "cosine" is of Muon, warms up and
+    `points` of every cloud are taken for a step, and the network is given a share of
+    them drawn between `sparsest` and 1; `queries` of those that this and Poisson disk
+    sampling leave over carry the loss. Schedule "cosine" is of Muon, warms up and
     decays to zero over `steps`; "paper" is of Adam, times 0.7 every 10 epochs.
     """
 
@@ -41,6 +42,7 @@ class Training:
     batch_size: int = 2
     points: int = 16384
     queries: int = 4096
+    sparsest: float = 1.0
     learning_rate: float = 0.01
     schedule: str = "cosine"
     warm_up: int = 100
@@ -55,6 +57,7 @@ class Training:
         whole("seed", self.seed, 0, LARGEST_SEED)
         positive("learning_rate", self.learning_rate)
         positive("clip_norm", self.clip_norm)
+        positive("sparsest", self.sparsest, 1.0)
         one_of("schedule", self.schedule, ("cosine", "paper"))
 
 
@@ -179,7 +182,7 @@ def make_example(
     config: Training, limits: Limits, batch: ShadedPoints, *, key: Key[Array, ""]
 ) -> tuple[Example, Demands]:
     """What a step needs of a batch's share before any parameter enters."""
-    sizes = config.points, config.queries
+    sizes = config.points, config.queries, config.sparsest
     return thin_and_search(config.network, limits, batch, *sizes, key=key)
 
 
@@ -232,19 +235,15 @@ def place(config: Training, state: TrainState) -> TrainState:
     return jax.device_put(state, everywhere)
 
 
+@partial(jax.jit, static_argnums=(0, 1))
 def probe_step(
     config: Training, limits: Limits, share: ShadedPoints, *, key: Any
 ) -> Demands:
     """Demands of one device's share of a batch."""
-    return _probe(config, limits, share, key)
+    return make_example(config, limits, share, key=key)[1]
 
 
 def share_key(config: Training, step: int, device: int) -> Key[Array, ""]:
     """The randomness of one device's share of the batch of a step."""
     key = jax.random.fold_in(jax.random.key(config.seed), step)
     return jax.random.fold_in(key, device)
-
-
-@partial(jax.jit, static_argnums=(0, 1))
-def _probe(config: Training, limits: Limits, share: ShadedPoints, key: Any) -> Demands:
-    return make_example(config, limits, share, key=key)[1]

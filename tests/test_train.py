@@ -10,6 +10,8 @@ import optax
 import pytest
 import tiny
 import two_devices
+from hypothesis import given
+from hypothesis import strategies as st
 
 from ginn_jax import example, objective, train
 from ginn_jax.geometry import Geometry
@@ -244,8 +246,10 @@ def test_left_over_points_carry_the_loss():
     assert real.tolist() == [True] * 9 + [False] * 2
 
 
-def test_queries_lie_beside_the_finest_level():
+@pytest.mark.parametrize("sparsest", [1.0, 0.1])
+def test_queries_lie_beside_the_finest_level(sparsest):
     config = replace(tiny.CONFIG, network=tiny.ONE_LEVEL, queries=100)
+    config = replace(config, sparsest=sparsest)
     build = partial(train.make_example, config, tiny.ONE_LEVEL_LIMITS)
     with tiny.cheap_compiling():
         made, _ = jax.jit(build)(tiny.batch(), key=jax.random.key(3))
@@ -256,8 +260,35 @@ def test_queries_lie_beside_the_finest_level():
     kept = np.array(level.position)[np.array(level.mask)].astype(np.float64)
     distance = np.linalg.norm(position[:, None] - kept, axis=-1).min(axis=1)
     assert distance.min() > 0
-    assert distance.max() < 0.08
+    # Of a share of the cloud, points are asked for that no Poisson disk covers.
+    assert (distance.max() < 0.08) == (sparsest == 1)
     # Each still has its own target, wherever rotation and thinning have put it.
     centred = position - np.outer(turned, [4, 0, 0])
     exact = tiny.exact_openness(centred, np.array(queries.normal))
     np.testing.assert_allclose(made.target, exact, atol=1e-4)
+
+
+@given(
+    mask=st.lists(st.booleans(), min_size=1, max_size=300),
+    sparsest=st.floats(0.05, 1.0),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_network_is_given_a_share_of_the_points(mask, sparsest, seed):
+    mask = np.array(mask)
+    key = jax.random.key(seed)
+    kept = np.array(example.given_share(jnp.array(mask), sparsest, key=key))
+    assert not (kept & ~mask).any()
+    assert (sparsest < 1) or (kept == mask).all()
+    # Eight standard deviations and more of the sparsest share.
+    least = sparsest * mask.sum() - 8 * np.sqrt(mask.sum())
+    assert kept.sum() >= least
+
+
+def test_shares_are_between_the_sparsest_and_all():
+    mask = jnp.ones(4000, bool)
+    keys = jax.random.split(jax.random.key(5), 200)
+    counts = jax.vmap(lambda key: example.given_share(mask, 0.2, key=key).mean())(keys)
+    # 200 draws of a uniform share: mean .6, deviation .016.
+    assert 0.18 < counts.min() < 0.25
+    assert 0.95 < counts.max() <= 1
+    assert abs(counts.mean() - 0.6) < 0.08
