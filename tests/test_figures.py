@@ -7,10 +7,13 @@ import jax
 import numpy as np
 import pytest
 import tiny
+from hypothesis import given
+from hypothesis import strategies as st
 
-from benchmarks import poisson_radii
+from benchmarks import poisson_radii, sample_counts
 from experiments import animation, environment_maps, evaluate, latent_features
 from ginn_jax import blocks, compare_networks, pretrained, train
+from ginn_jax.dataset import count_given
 from ginn_jax.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("cheap_compiling")
@@ -87,6 +90,33 @@ def test_every_light_has_its_error_and_its_picture(tmp_path):
     assert all(row["relative_mse_2d"] > 0 for row in metrics["lights"])
     assert (tmp_path / "lights.png").stat().st_size > 1000
     assert "point light 0" in (tmp_path / "report.md").read_text()
+
+
+@pytest.mark.parametrize("effect", ["ao", "gi"])
+def test_fewer_samples_are_given_and_others_asked(tmp_path, effect):
+    options = sample_counts.Options(
+        effect,
+        out=tmp_path,
+        objects=1,
+        shares=(1.0, 0.5),
+        points=1500,
+        reference=8,
+        looks=8,
+    )
+    whole, half = sample_counts.main(options)["rows"]
+    assert (whole["samples"], half["samples"]) == (1200, 600)
+    assert whole["mse_3d"] != half["mse_3d"]
+    assert "| 1200 |" in (tmp_path / "report.md").read_text()
+
+
+@given(count=st.integers(100, 5000), share=st.floats(0.05, 1))
+def test_shares_of_a_cloud_are_of_both_its_parts(count, share):
+    rows = sample_counts.rows_of(count, share)
+    given_rows = rows[rows < count_given(count)]
+    assert len(rows) == int(count * share)
+    assert len(given_rows) == count_given(len(rows))
+    assert len(set(rows)) == len(rows)
+    assert rows.max() < count
 
 
 @pytest.mark.parametrize("effect", ["ao", "gi"])

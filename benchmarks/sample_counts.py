@@ -1,0 +1,133 @@
+"""Error at points against how many samples a cloud has.
+
+    python -m benchmarks.sample_counts --effect ao
+
+A network is given ever fewer samples of the same clouds, and asked at the same points.
+"""
+
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from benchmarks.timing import circumstances, describe
+from ginn_jax import compare, evaluate, report
+from ginn_jax.commandline import require, require_positive, start
+from ginn_jax.compare_networks import Trained, errors_at_points, load_trained
+from ginn_jax.dataset import count_given
+from ginn_jax.errors import InputError
+from ginn_jax.lit_clouds import Cloud, LitCloud
+from ginn_jax.scenes import cloud_path, make_cloud, read_cloud
+
+
+@dataclass(frozen=True)
+class Options:
+    """Errors of a trained network on sparser and denser clouds."""
+
+    effect: Literal["ao", "gi", "sss"] = "ao"
+    """Ambient occlusion, global illumination or subsurface scattering."""
+    out: Path = Path("runs/sample_counts")
+    """Folder for clouds, metrics.json and report.md."""
+    checkpoint: Path | None = None
+    """The --out of a training run; left out, the weights that come with the package."""
+    meshes: Path | None = None
+    """A mesh file or a folder of meshes; left out, procedural shapes."""
+    envmaps: Path | None = None
+    """An environment map or a folder of them; left out, procedural skies."""
+    objects: int = 8
+    """How many scenes, evenly spread over the meshes; training saw none of them."""
+    shares: tuple[float, ...] = (1.0, 0.5, 0.25, 0.125)
+    """Shares of four fifths of the samples; a fifth measures."""
+    points: int | None = None
+    """Samples of an object; left out, 64,000 for occlusion, 32,000 for light."""
+    reference: int = 256
+    """Rays or paths of the reference."""
+    looks: int = 512
+    """Directions of the direct light per sample."""
+    radius: float = 0.1
+    """Occlusion radius."""
+    quick: bool = False
+    """One scene, two shares, few rays: to try things, not for numbers."""
+
+
+QUICK = {"objects": 1, "shares": (1.0, 0.5), "points": 4000, "reference": 32}
+QUICK |= {"looks": 32}
+
+
+def main(options: Options) -> dict[str, Any]:
+    """Measure every share; returns what metrics.json holds."""
+    least = {"objects": 1, "points": 1000, "reference": 2, "looks": 1}
+    require(options, least)
+    require_positive(options, "radius")
+    if not all(0.01 <= share <= 1 for share in options.shares):
+        raise InputError(f"--shares {options.shares} must be from 0.01 to 1")
+    begin = time.perf_counter()
+    counts = options.points, options.reference
+    settings = compare.effect_settings(options.effect, *counts, options.radius)
+    settings = compare.with_looks(settings, options.looks)
+    trained = load_trained(
+        options.effect, settings, options.checkpoint, key=jax.random.key(0)
+    )
+    where = options.meshes, options.envmaps
+    sources = compare.unseen_sources(options.effect, options.objects, *where, seed=0)
+    clouds = []
+    for source in sources:
+        path = cloud_path(options.out / "clouds", source)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        make_cloud(source, settings, path)
+        clouds.append(read_cloud(source, settings, path))
+    rows = []
+    for share in options.shares:
+        fewer = [thinned(cloud, share) for cloud in clouds]
+        found, _ = errors_at_points({"ours": trained}, fewer, sources, settings)
+        given = count_given(len(fewer[0].position))
+        rows.append({"samples": given} | found["ours"])
+    metrics = {"rows": rows} | circumstances(options, begin)
+    text = write_report(options, trained, metrics)
+    report.write_results(options.out, metrics, text)
+    print(text)
+    return metrics
+
+
+def thinned(cloud: Cloud, share: float) -> Cloud:
+    """A share of the samples that a network is given, and of those it is asked at."""
+    take = partial(np.take, indices=rows_of(len(cloud.position), share), axis=0)
+    if not isinstance(cloud, LitCloud):
+        return jax.tree.map(take, cloud)
+    whole = {"albedo": cloud.albedo, "medium": cloud.medium}
+    parts = {n: take(a) for n, a in cloud._asdict().items() if n not in whole}
+    return LitCloud(**parts, **whole)
+
+
+def rows_of(count: int, share: float) -> Int[np.ndarray, "_"]:
+    """The first of four fifths of the rows, and of the last fifth."""
+    given = count_given(count)
+    total = int(count * share)
+    first = count_given(total)
+    return np.r_[:first, given : given + total - first]
+
+
+def write_report(options: Options, trained: Trained, metrics: evaluate.Row) -> str:
+    """The table and how it was measured."""
+    heads = {"samples": "samples given", "relative_mse_3d": "relative 3D MSE"}
+    heads |= {"median_relative_mse_3d": "median", "noise_floor_3d": "noise floor"}
+    heads |= {"equal_rays": "equal rays or paths"}
+    return f"""# Error against the number of samples, effect {options.effect}
+
+{describe()}
+
+{options.objects} scenes, Poisson disk radii {trained[0].levels}. The network is given
+the first of the same samples, and asked at the first of the same other points; noise of
+the reference ({options.reference} rays or paths) is subtracted. Relative: over the
+variance of the target, pooled over the scenes.
+
+{report.table_of(metrics["rows"], heads)}"""
+
+
+if __name__ == "__main__":
+    start(Options, main, QUICK, __doc__)
