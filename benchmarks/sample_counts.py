@@ -6,7 +6,7 @@ A network is given ever fewer samples of the same clouds, and asked at the same 
 """
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -19,10 +19,16 @@ from benchmarks.timing import circumstances, describe
 from ginn_jax import compare, evaluate, report
 from ginn_jax.commandline import require, require_positive, start
 from ginn_jax.compare_networks import Trained, errors_at_points, load_trained
-from ginn_jax.dataset import count_given
+from ginn_jax.dataset import count_asked, count_given
 from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import Cloud, LitCloud
-from ginn_jax.scenes import cloud_path, make_cloud, read_cloud
+from ginn_jax.scenes import (
+    Occlusion,
+    Settings,
+    cloud_path,
+    make_cloud,
+    read_cloud,
+)
 
 
 @dataclass(frozen=True)
@@ -84,14 +90,22 @@ def main(options: Options) -> dict[str, Any]:
     rows = []
     for share in options.shares:
         fewer = [thinned(cloud, share) for cloud in clouds]
-        found, _ = errors_at_points({"ours": trained}, fewer, sources, settings)
-        given = count_given(len(fewer[0].position))
-        rows.append({"samples": given} | found["ours"])
+        count = len(fewer[0].position)
+        given = {"ours": trained}, fewer, sources, with_points(settings, count)
+        found = errors_at_points(*given)[0]["ours"]
+        rows.append({"samples": count_given(count)} | found)
     metrics = {"rows": rows} | circumstances(options, begin)
     text = write_report(options, trained, metrics)
     report.write_results(options.out, metrics, text)
     print(text)
     return metrics
+
+
+def with_points(settings: Settings, count: int) -> Settings:
+    """The settings of clouds of so many samples."""
+    if isinstance(settings, Occlusion):
+        return replace(settings, points=count)
+    return replace(settings, points=count, targets=count_asked(count))
 
 
 def thinned(cloud: Cloud, share: float) -> Cloud:

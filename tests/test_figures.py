@@ -106,6 +106,8 @@ def test_fewer_samples_are_given_and_others_asked(tmp_path, effect):
     whole, half = sample_counts.main(options)["rows"]
     assert (whole["samples"], half["samples"]) == (1200, 600)
     assert whole["mse_3d"] != half["mse_3d"]
+    # Asked where there is no target, half of the noise would be missing.
+    assert half["noise_floor_3d"] == pytest.approx(whole["noise_floor_3d"], rel=0.3)
     assert "| 1200 |" in (tmp_path / "report.md").read_text()
 
 
