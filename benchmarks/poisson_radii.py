@@ -30,7 +30,7 @@ from ginn_jax.compare_tracing import trace
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Row
 from ginn_jax.objects import Source
-from ginn_jax.scenes import Settings, cloud_path, make_cloud, read_cloud
+from ginn_jax.scenes import Settings, made_cloud
 
 TIMES = "seconds_3d", "seconds_2d", "seconds"
 
@@ -125,10 +125,7 @@ def compare_radii(
     shot = compare.take_shot(stage, camera, settings, seed=seed)
     truth = trace(shot, settings, options.reference, seed=seed)
     shot = compare.with_truth(shot, truth)
-    path = cloud_path(options.out / "clouds", source)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    make_cloud(source, settings, path)
-    cloud = read_cloud(source, settings, path)
+    cloud = made_cloud(source, settings, options.out / "clouds")
     given, _ = points_given(cloud)
     at_points, networks = errors_at_points(networks, [cloud], [source], settings)
     seconds: dict[str, list[Row]] = {name: [] for name in networks}

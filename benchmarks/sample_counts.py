@@ -2,12 +2,11 @@
 
     python -m benchmarks.sample_counts --effect ao
 
-A network is given ever fewer samples of the same clouds, and asked at the same points.
+A network is given the first of the same samples, ever fewer, and asked at others.
 """
 
 import time
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,14 +20,8 @@ from ginn_jax.commandline import require, require_positive, start
 from ginn_jax.compare_networks import Trained, errors_at_points, load_trained
 from ginn_jax.dataset import count_asked, count_given
 from ginn_jax.errors import InputError
-from ginn_jax.lit_clouds import Cloud, LitCloud
-from ginn_jax.scenes import (
-    Occlusion,
-    Settings,
-    cloud_path,
-    make_cloud,
-    read_cloud,
-)
+from ginn_jax.lit_clouds import Cloud, LitCloud, take_points
+from ginn_jax.scenes import Occlusion, Settings, made_cloud
 
 
 @dataclass(frozen=True)
@@ -81,12 +74,7 @@ def main(options: Options) -> dict[str, Any]:
     )
     where = options.meshes, options.envmaps
     sources = compare.unseen_sources(options.effect, options.objects, *where, seed=0)
-    clouds = []
-    for source in sources:
-        path = cloud_path(options.out / "clouds", source)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        make_cloud(source, settings, path)
-        clouds.append(read_cloud(source, settings, path))
+    clouds = [made_cloud(s, settings, options.out / "clouds") for s in sources]
     rows = []
     for share in options.shares:
         fewer = [thinned(cloud, share) for cloud in clouds]
@@ -110,12 +98,10 @@ def with_points(settings: Settings, count: int) -> Settings:
 
 def thinned(cloud: Cloud, share: float) -> Cloud:
     """A share of the samples that a network is given, and of those it is asked at."""
-    take = partial(np.take, indices=rows_of(len(cloud.position), share), axis=0)
-    if not isinstance(cloud, LitCloud):
-        return jax.tree.map(take, cloud)
-    whole = {"albedo": cloud.albedo, "medium": cloud.medium}
-    parts = {n: take(a) for n, a in cloud._asdict().items() if n not in whole}
-    return LitCloud(**parts, **whole)
+    rows = rows_of(len(cloud.position), share)
+    if isinstance(cloud, LitCloud):
+        return take_points(cloud, rows)
+    return jax.tree.map(lambda a: a[rows], cloud)
 
 
 def rows_of(count: int, share: float) -> Int[np.ndarray, "_"]:

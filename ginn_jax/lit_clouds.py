@@ -95,11 +95,14 @@ def unit_floor(clouds: Sequence[LitCloud]) -> float:
 
 def split_points(cloud: LitCloud, count: int) -> tuple[LitCloud, LitCloud]:
     """The first `count` points, and the others."""
+    return take_points(cloud, slice(count)), take_points(cloud, slice(count, None))
+
+
+def take_points(cloud: LitCloud, rows: Any) -> LitCloud:
+    """Some points of a cloud, by an index of their rows."""
     whole = {"albedo": cloud.albedo, "medium": cloud.medium}
-    points = {n: a for n, a in cloud._asdict().items() if n not in whole}
-    first = {name: a[:count] for name, a in points.items()}
-    rest = {name: a[count:] for name, a in points.items()}
-    return LitCloud(**first, **whole), LitCloud(**rest, **whole)
+    points = {n: a[rows] for n, a in cloud._asdict().items() if n not in whole}
+    return LitCloud(**points, **whole)
 
 
 def save_lit_cloud(path: Path, cloud: LitCloud, origin: dict[str, Any]) -> None:

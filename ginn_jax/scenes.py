@@ -77,6 +77,14 @@ def read_cloud(source: Source, settings: Settings, path: Path) -> Cloud:
     return load_lit_cloud(path, origin)
 
 
+def made_cloud(source: Source, settings: Settings, folder: Path) -> Cloud:
+    """A cloud, made unless `folder` already holds it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = cloud_path(folder, source)
+    make_cloud(source, settings, path)
+    return read_cloud(source, settings, path)
+
+
 def make_clouds(
     sources: Sequence[Source], settings: Settings, folder: Path, workers: int
 ) -> Iterator[Path]:
