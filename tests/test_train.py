@@ -126,8 +126,8 @@ def test_non_finite_gradient_is_skipped_and_counted(value):
 def check_loss_of_zero_network(config=tiny.CONFIG, limits=tiny.LIMITS):
     """A network that says 0 has the mean square of the targets for its loss.
 
-    Each cloud has its own constant, so a cloud that is not counted shows, as does one
-    that counts twice.
+    Each cloud has its own constant, 1 or 3, so that the loss says how many of the
+    queries are of the second: about half, and a whole number.
     """
     state = tiny.fresh_state(config, limits)
     last = state.variables["shader"]["params"]["Dense_1"]
@@ -137,7 +137,10 @@ def check_loss_of_zero_network(config=tiny.CONFIG, limits=tiny.LIMITS):
     target = np.ones_like(tiny.batch().target) * np.array([[1], [3]], np.float32)
     _, report = tiny.step(state, tiny.batch()._replace(target=target), config, limits)
     assert report.fits
-    np.testing.assert_allclose(report.loss, (1 + 9) / 2, rtol=1e-6)
+    queries = config.queries * config.batch_size
+    of_second = (report.loss - 1) / (9 - 1) * queries
+    np.testing.assert_allclose(of_second, queries / 2, rtol=0.05)
+    np.testing.assert_allclose(of_second, np.round(of_second), atol=1e-3)
     # That of the last bias alone is 2 * mean(0 - target) = -4.
     assert 4 < report.gradient_norm < 100
 
