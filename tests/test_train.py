@@ -123,11 +123,11 @@ def test_non_finite_gradient_is_skipped_and_counted(value):
     assert (int(after.step), int(after.skipped)) == (1, 1)
 
 
-def check_loss_of_zero_network(config=tiny.CONFIG, limits=tiny.LIMITS):
+def check_loss_of_zero_network(config, limits, of_second):
     """A network that says 0 has the mean square of the targets for its loss.
 
-    Each cloud has its own constant, 1 or 3, so that the loss says how many of the
-    queries are of the second: about half, and a whole number.
+    Each cloud has its own constant, 1 or 3, so a cloud that is not counted shows, as
+    does one that counts twice; `of_second` of the queries are of the second.
     """
     state = tiny.fresh_state(config, limits)
     last = state.variables["shader"]["params"]["Dense_1"]
@@ -137,16 +137,22 @@ def check_loss_of_zero_network(config=tiny.CONFIG, limits=tiny.LIMITS):
     target = np.ones_like(tiny.batch().target) * np.array([[1], [3]], np.float32)
     _, report = tiny.step(state, tiny.batch()._replace(target=target), config, limits)
     assert report.fits
-    queries = config.queries * config.batch_size
-    of_second = (report.loss - 1) / (9 - 1) * queries
-    np.testing.assert_allclose(of_second, queries / 2, rtol=0.05)
-    np.testing.assert_allclose(of_second, np.round(of_second), atol=1e-3)
+    share = of_second / (config.queries * config.batch_size)
+    np.testing.assert_allclose(report.loss, 1 + (9 - 1) * share, rtol=1e-6)
     # That of the last bias alone is 2 * mean(0 - target) = -4.
     assert 4 < report.gradient_norm < 100
 
 
 def test_loss_is_the_mean_square_error():
-    check_loss_of_zero_network()
+    target = np.ones_like(tiny.batch().target) * np.array([[0], [1]], np.float32)
+    build = partial(train.make_example, tiny.CONFIG, tiny.LIMITS)
+    with tiny.cheap_compiling():
+        key = train.share_key(tiny.CONFIG, 0, 0)
+        made, _ = jax.jit(build)(tiny.batch()._replace(target=target), key=key)
+    assert made.queries.mask.all()
+    of_second = int(made.target.sum())
+    assert abs(of_second - 128) < 8
+    check_loss_of_zero_network(tiny.CONFIG, tiny.LIMITS, of_second)
 
 
 TWO_DEVICES = """
@@ -158,7 +164,7 @@ assert train.batch_mesh(3).size == 1
 import test_train, tiny
 config = replace(tiny.CONFIG, network=tiny.ONE_LEVEL)
 limits = tiny.ONE_LEVEL_LIMITS
-test_train.check_loss_of_zero_network(config, limits)
+test_train.check_loss_of_zero_network(config, limits, config.queries)
 state, data = tiny.fresh_state(config, limits), tiny.batch()
 for _ in range(2):
     state, report = tiny.step(state, data, config, limits)
