@@ -31,7 +31,7 @@ class VoxelGrid(NamedTuple):
     layer: Int[Array, "N"]
     column_start: Int[Array, "T"]
     origin: Float[Array, "3"]
-    cell: Float[Array, "3"]
+    rate: Float[Array, "3"]
     shape: Int[Array, "3"]
 
 
@@ -41,15 +41,17 @@ def build_grid(
     """Sort points into columns `cell` wide; wider where the cloud has too many."""
     origin, extent = _bounds(position, mask)
     table = min(max(position.shape[0], FEWEST), TABLE)
-    size = _cell_size(extent, cell, table)
-    shape = jnp.floor(extent / size).astype(jnp.int32) + 1
-    x, y, layer = jnp.floor((position - origin) / size).astype(jnp.int32).T
+    # Points, border and queries have to be rounded alike, or a pair is lost between
+    # cells. Of a division XLA makes now one, now a product with the inverse.
+    rate = jax.lax.optimization_barrier(1.0 / _cell_size(extent, cell, table))
+    shape = jnp.floor(extent * rate).astype(jnp.int32) + 1
+    x, y, layer = jnp.floor((position - origin) * rate).astype(jnp.int32).T
     column = jnp.where(mask, x * shape[1] + y, table).astype(jnp.uint32)
     order = stable_order(jnp.where(mask, layer, 0).astype(jnp.uint32), 16)
     order = order[stable_order(column[order], 16)]
     count = jnp.zeros(table, jnp.int32).at[column].add(1, mode="drop")
     start = jnp.concatenate([jnp.zeros(1, jnp.int32), prefix_sum(count)])
-    return VoxelGrid(position[order], order, layer[order], start, origin, size, shape)
+    return VoxelGrid(position[order], order, layer[order], start, origin, rate, shape)
 
 
 def stable_order(key: UInt32[Array, "N"], bits: int) -> Int[Array, "N"]:
@@ -128,7 +130,7 @@ def cell_of(
     grid: VoxelGrid, coordinate: Float[Array, "*K"], axis: int
 ) -> Int[Array, "*K"]:
     """Cell along one axis; -1 or `shape` where it lies outside. Monotone."""
-    cell = jnp.floor((coordinate - grid.origin[axis]) / grid.cell[axis])
+    cell = jnp.floor((coordinate - grid.origin[axis]) * grid.rate[axis])
     top = grid.shape[axis].astype(jnp.float32)
     return jnp.clip(cell, -1.0, top).astype(jnp.int32)
 

@@ -119,6 +119,15 @@ def test_host_search_of_nothing_finds_nothing(points, queries):
     assert pairs == [(0, 0)] * (points * queries)
 
 
+@pytest.mark.parametrize("radius", [0.1, 0.05, 0.3])
+def test_jitted_search_finds_what_lies_on_the_far_border(radius):
+    """Of a box of whole cells, in which rounding decides about one cell more."""
+    for cells in range(1, 120):
+        far = np.float32(cells) * np.float32(radius)
+        cloud = pad(np.array([[-0.3, 0, 0], [far - np.float32(0.3), far, far]]), POINTS)
+        assert pairs_of(edges_of(cloud, cloud, radius), cloud) >= {(0, 0), (1, 1)}
+
+
 @settings(max_examples=50)
 @given(padded(), padded(QUERIES), RADII)
 def test_jitted_search_equals_brute_force_but_for_rounding(points, queries, radius):
