@@ -87,10 +87,13 @@ def same_but_for_rounding(
     a: Pairs, b: Pairs, points: np.ndarray, queries: np.ndarray, radius: float
 ) -> bool:
     """Whether the pairs are the same but for distances within 1e-5 of the radius."""
-    codes = [q.astype(np.int64) * len(points) + p for q, p in (a, b)]
-    if len(np.unique(codes[1])) != len(codes[1]):
+    one, other = (np.sort(q.astype(np.int64) * len(points) + p) for q, p in (a, b))
+    if (other[1:] == other[:-1]).any():  # a pair twice
         return False
-    query, point = np.divmod(np.setxor1d(codes[0], codes[1]), len(points))
+    if np.array_equal(one, other):
+        return True
+    differing = np.setxor1d(one, other, assume_unique=True)
+    query, point = np.divmod(differing, len(points))
     distance = np.linalg.norm(queries[query] - points[point], axis=1)
     return bool((np.abs(distance / radius - 1) < 1e-5).all())
 

@@ -50,6 +50,7 @@ def test_pairs_may_differ_at_the_radius_only():
     assert same(two, three, points, queries, 1.0)
     assert not same(two, three, points, queries, 1.1)
     assert not same(three, (two[0][:1], two[1][:1]), points, queries, 1.0)
+    assert not same(two, (np.zeros(3, int), np.array([0, 2, 2])), points, queries, 1.0)
 
 
 def test_neighbors(tmp_path, monkeypatch):
