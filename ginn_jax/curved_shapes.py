@@ -31,11 +31,34 @@ def vase(rng: Rng) -> Solid:
     flutes = rng.uniform(0.05, 0.2) if rng.random() < 0.4 else 0.0
     body = turned(profile(radius, height), 6 * int(rng.integers(4, 13)), flutes)
     if hollow and rng.random() < 0.4:
-        grip = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-        arm = np.stack([np.cos(grip), np.sin(grip), 0 * grip], -1) * 0.2
-        arm += [radius[20], height[20], 0]
-        return join([body, tube(arm, 0.03, closed=True)])
+        return join([body, _ring([radius[20], height[20], 0], 0.2, 0.03)])
     return body
+
+
+def vessel(rng: Rng) -> Solid:
+    """A wide hollow, round or cornered: cup, bowl, bucket, tub, crate; some filled."""
+    wide, high = rng.uniform(0.25, 0.6), rng.uniform(0.3, 1.2)
+    wall = rng.uniform(0.015, 0.08)
+    height = np.linspace(0, high, 12)
+    flare = rng.choice([0, 0, 0.3, 0.6]) * rng.uniform(-0.5, 1)
+    belly = rng.choice([0, 0, 0.3]) * np.sin(np.pi * height / high)
+    radius = wide * (1 + flare * (height / high - 0.5) + belly)
+    keep = height > rng.uniform(1, 2) * wall
+    inner = np.maximum(radius - wall, 0.05)[keep]
+    line = profile(np.r_[radius, inner[::-1]], np.r_[height, height[keep][::-1]])
+    solids = [turned(line, int(rng.choice([4, 4, 6, 24, 48, 72])))]
+    if rng.random() < 0.4:
+        size = rng.uniform(0.15, 0.4) * high
+        solids.append(_ring([wide, high / 2, 0], size, rng.uniform(0.02, 0.06)))
+    for _ in range(rng.choice([0, 0, 0, 1, 3])):
+        size, away = rng.uniform(0.1, 0.4, 2) * wide
+        around = rng.uniform(0, 2 * np.pi)
+        place = [away * np.cos(around), size + wall, away * np.sin(around)]
+        filling = trimesh.creation.icosphere(3, size)
+        solids.append(filling.apply_translation(place))
+    tipped = rng.choice([0, 0, 0.3, 2]) * rng.normal()
+    tip = trimesh.transformations.rotation_matrix(tipped, [0, 0, 1])
+    return join(solids).apply_transform(tip)
 
 
 def plant(rng: Rng) -> Solid:
@@ -109,6 +132,13 @@ def cloth(rng: Rng) -> Solid:
         turn[:3, 3] = rng.uniform(-0.3, 0.3, 3)
         solids.append(solid.apply_transform(turn))
     return join(solids)
+
+
+def _ring(centre, radius: float, thickness: float) -> Solid:
+    """A handle: a closed round tube about z."""
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    path = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1) * radius
+    return tube(path + centre, thickness, closed=True)
 
 
 def _leaf(rng: Rng, root: np.ndarray, way: np.ndarray) -> Solid:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from experiments.shape_sheet import contact_sheet
-from ginn_jax import clad_shapes, reference, sdf, shapes, solids
+from ginn_jax import clad_shapes, curved_shapes, reference, sdf, shapes, solids
 from ginn_jax.mesh import add_ground, make_mesh
 from ginn_jax.samples import sample_surface
 
@@ -59,6 +59,14 @@ def test_most_of_each_family_is_seen_from_outside(name):
         )
         seen.append((shade.mean > 0).mean())
     assert np.mean(seen) > 0.6
+
+
+@settings(max_examples=25, deadline=None)
+@given(SEED)
+def test_a_vessel_holds_more_than_its_wall_takes(seed):
+    solid = curved_shapes.vessel(np.random.default_rng(seed))
+    body = solid.split(only_watertight=False)[0]
+    assert 0 < body.volume < 0.75 * body.convex_hull.volume
 
 
 AXES = hnp.arrays(float, (3, 3), elements=st.floats(-1, 1)).filter(
