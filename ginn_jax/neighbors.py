@@ -26,6 +26,8 @@ from ginn_jax.voxels import VoxelGrid, build_grid, morton_code
 
 QUERY_BLOCK = 1 << 17
 WORD_BLOCK = 1 << 16
+# So rarely is a pair to be left out that copying what lies between them is faster.
+FEW = 1000
 # Squares of lengths from 1 / FAR to FAR are normal numbers in float32.
 FAR = 1e18
 
@@ -71,7 +73,7 @@ def find_neighbors(
         block = queries[first : first + QUERY_BLOCK]
         near = np.asarray(block - center, np.float32)
         found = _search_block(grid, near, shell, first)
-        return [(pairs, _wrong(pairs, points, queries, radius)) for pairs in found]
+        return [_decide(pairs, points, queries, radius) for pairs in found]
 
     with ThreadPoolExecutor(available_cores()) as pool:
         blocks = pool.map(search, range(0, len(queries), QUERY_BLOCK))
@@ -144,16 +146,22 @@ def _along_curve(
     return code.astype(np.uint32).astype(np.int32)
 
 
-def _wrong(
+def _decide(
     pairs: Pairs,
     points: Float[np.ndarray, "N 3"],
     queries: Float[np.ndarray, "M 3"],
     radius: float,
-) -> Int[np.ndarray, "K"]:
-    """Which pairs float64 finds to be as far apart as the radius."""
+) -> tuple[Pairs, Int[np.ndarray, "K"]]:
+    """The pairs and which of them float64 finds to be as far apart as the radius.
+
+    Where those are many they are left out here, not by `_join`.
+    """
     doubtful = np.flatnonzero(pairs.doubtful)
     offset = points[pairs.point[doubtful]] - queries[pairs.query[doubtful]]
-    return doubtful[np.sum(offset**2, axis=-1) >= radius**2]
+    wrong = doubtful[np.sum(offset**2, axis=-1) >= radius**2]
+    if len(wrong) * FEW <= len(pairs.query):
+        return pairs, wrong
+    return Pairs(*(np.delete(column, wrong) for column in pairs)), wrong[:0]
 
 
 def _join(

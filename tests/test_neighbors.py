@@ -82,11 +82,14 @@ def test_host_search_equals_brute_force(points, queries, radius):
     hnp.arrays(np.float64, (12, 3), elements=st.integers(-5, 5).map(lambda k: k * 0.1)),
     st.sampled_from([0.1, 0.2, 0.3]),
     st.sampled_from([0.0, 1e4]),
+    st.sampled_from([0, 1000]),
 )
-def test_host_search_is_exact_at_the_radius(cloud, radius, shift):
+def test_host_search_is_exact_at_the_radius(cloud, radius, shift, few):
     """Distances that differ from the radius by one rounding of float64, or by none."""
     cloud = cloud + shift
-    assert found(cloud, cloud, radius) == neighbors(cloud, cloud, radius)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(nb, "FEW", few)  # left out one by one, or all at once
+        assert found(cloud, cloud, radius) == neighbors(cloud, cloud, radius)
 
 
 def test_host_search_accepts_float32_points():
