@@ -170,7 +170,8 @@ def block_memory(
     queries = Oriented(zeros, zeros, np.ones(rows, bool))
     flat = inference.only(limits, network.query.name)
     turn = blocks.turn_shapes(blocks.Turn(queries))
-    lowered = inference.shade_turn.lower(network, flat, True, variables, encoded, turn)
+    shared = blocks.everywhere((variables, encoded))
+    lowered = inference.shade_turn.lower(network, flat, True, *shared, turn)
     memory = lowered.compile().memory_analysis()
     return int(memory.temp_size_in_bytes) if memory else 0
 
