@@ -214,7 +214,7 @@ def _list(
     """`Pairs` of queries by number, from `first` on."""
     (row, receiver, _), _ = list_bits(words, near, capacity)
     offset = query[receiver] - grid.position[row]
-    doubtful = jnp.sum(offset**2, axis=-1) > certain**2
+    doubtful = jnp.sum(offset**2, axis=-1) >= certain**2
     return first + receiver, grid.index[row], doubtful
 
 

@@ -92,6 +92,14 @@ def test_host_search_is_exact_at_the_radius(cloud, radius, shift, few):
         assert found(cloud, cloud, radius) == neighbors(cloud, cloud, radius)
 
 
+def test_host_search_tells_apart_what_float32_does_not():
+    points = np.array([[0.0, 0, 0], [1e6, 0, 0]])
+    queries = np.array([[1e6, 0.01, 0], [1e6 - 0.004, 0, 0]])
+    for radius in (0.003, 0.005, 0.02):
+        expected = neighbors(points, queries, radius)
+        assert found(points, queries, radius) == expected
+
+
 def test_host_search_accepts_float32_points():
     cloud = np.random.default_rng(0).random((40, 3), np.float32)
     assert found(cloud, cloud, 0.3) == neighbors(cloud, cloud, 0.3)
