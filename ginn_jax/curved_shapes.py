@@ -111,6 +111,20 @@ def bars(rng: Rng) -> Solid:
     return join(solids)
 
 
+def wheel(rng: Rng) -> Solid:
+    """A rim on thin spokes, some of which cross; a pair or a row of them on an axle."""
+    hub, one = _spoked_rim(rng)
+    copies, apart = int(rng.choice([1, 1, 2, 2, 5])), rng.uniform(0.3, 1.5)
+    if copies == 1:
+        return one
+    solids = [rod([0, 0, 0], [0, 0, (copies - 1) * apart], 0.5 * hub, 0.5 * hub)]
+    for i, angle in enumerate(rng.uniform(0, 2 * np.pi, copies)):
+        turn = trimesh.transformations.rotation_matrix(angle, [0, 0, 1])
+        turn[2, 3] = i * apart
+        solids.append(one.copy().apply_transform(turn))
+    return join(solids)
+
+
 def cloth(rng: Rng) -> Solid:
     """Sheets that are bent, waved and creased, alone, stacked or crossing."""
     solids = []
@@ -139,6 +153,22 @@ def _ring(centre, radius: float, thickness: float) -> Solid:
     angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     path = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1) * radius
     return tube(path + centre, thickness, closed=True)
+
+
+def _spoked_rim(rng: Rng) -> tuple[float, Solid]:
+    """The radius of the hub, and hub, spokes and rim about z; the rim's radius is 1."""
+    count, thin = int(rng.integers(5, 40)), rng.uniform(0.004, 0.03)
+    hub, wide = rng.uniform(0.04, 0.25), rng.uniform(0.02, 0.4)
+    tyre, cross = rng.uniform(0.02, 0.15), rng.choice([0, 1, 3]) * 2 * np.pi / count
+    angle = np.arange(count) * 2 * np.pi / count
+    side = 0.5 * wide * (-1.0) ** np.arange(count)
+    lean = cross * (-1.0) ** (np.arange(count) // 2)
+    inner = np.stack([hub * np.cos(angle), hub * np.sin(angle), side], -1)
+    outer = np.stack([np.cos(angle + lean), np.sin(angle + lean), 0 * side], -1)
+    solids = [rod(a, b, thin, thin, 6) for a, b in zip(inner, outer, strict=True)]
+    solids.append(_ring(np.zeros(3), 1.0, tyre))
+    solids.append(rod([0, 0, -wide / 2], [0, 0, wide / 2], hub, hub, 12))
+    return hub, join(solids)
 
 
 def _leaf(rng: Rng, root: np.ndarray, way: np.ndarray) -> Solid:

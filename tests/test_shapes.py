@@ -69,6 +69,14 @@ def test_a_vessel_holds_more_than_its_wall_takes(seed):
     assert 0 < body.volume < 0.75 * body.convex_hull.volume
 
 
+@settings(max_examples=25, deadline=None)
+@given(SEED)
+def test_a_wheel_is_closed_and_mostly_air(seed):
+    solid = curved_shapes.wheel(np.random.default_rng(seed))
+    assert solid.is_watertight
+    assert 0 < solid.volume < 0.5 * solid.convex_hull.volume
+
+
 AXES = hnp.arrays(float, (3, 3), elements=st.floats(-1, 1)).filter(
     lambda a: abs(np.linalg.det(a)) > 0.05
 )
