@@ -20,7 +20,7 @@ from ginn_jax.lighting import (
     turned,
 )
 from ginn_jax.mesh import Mesh, add_ground, fit_unit_box, load_mesh
-from ginn_jax.shapes import random_shape
+from ginn_jax.shapes import SHAPES, random_shape
 
 T = TypeVar("T")
 # Seeds of what is trained on lie below UNSEEN_SEED, `SEEDS_APART` for each --seed.
@@ -196,7 +196,10 @@ def random_point_light(seed: int) -> PointLight:
 def origin_of(source: Source) -> dict[str, Any]:
     """What a source is, files by the checksum of their contents."""
     found: dict[str, Any] = {"seed": source.seed}
-    found["object"] = _contents(source.path) if source.path else source.name
+    if source.path:
+        found["object"] = _contents(source.path)
+    else:
+        found |= {"object": source.name, "shapes": SHAPES}
     if light := source.light:
         found["light"] = _contents(light.path) if light.path else light.name
     return found

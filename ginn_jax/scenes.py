@@ -20,7 +20,9 @@ from ginn_jax.reference import ambient_occlusion, build_scene
 # which a pool may wait forever for a process that it does not start (python/cpython
 # #115634).
 SCENES_PER_WORKER = 200
-FORMAT = 5
+# Raised where an effect's ground truth becomes another, so that what was made is not
+# taken for it.
+FORMATS = {"occlusion": 5, "illumination": 5, "scattering": 6}
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,8 @@ def occlusion_cloud(mesh: Mesh, settings: Occlusion, seed: int) -> ShadedPoints:
 def cloud_origin(source: Source, settings: Settings) -> dict[str, Any]:
     """Everything a cloud depends on; files by their checksums."""
     effect = type(settings).__name__.lower()
-    return {"format": FORMAT, "effect": effect, **asdict(settings)} | origin_of(source)
+    made = {"format": FORMATS[effect], "effect": effect, **asdict(settings)}
+    return made | origin_of(source)
 
 
 def make_cloud(source: Source, settings: Settings, path: Path) -> None:

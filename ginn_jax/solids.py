@@ -7,14 +7,29 @@ import trimesh
 from jaxtyping import Float
 
 Solid = trimesh.Trimesh
+# Fractional parts of its multiples are all different and far apart.
+GOLDEN = 0.6180339887498949
 
 
 def join(solids: list[Solid]) -> Solid:
-    """All solids in one mesh; where they overlap, both surfaces stay."""
+    """All solids in one mesh; where they overlap, both surfaces stay.
+
+    Each grows about its middle by its own 1 to 2 parts in 10,000, so that solids that
+    touch overlap: no ray can tell in which order it crosses faces that coincide.
+    """
+    solids = [
+        _grown(solid, 1e-4 * (1 + i * GOLDEN % 1)) for i, solid in enumerate(solids)
+    ]
     starts = np.cumsum([0, *(len(solid.vertices) for solid in solids)])
     faces = [solid.faces + start for solid, start in zip(solids, starts, strict=False)]
     vertices = np.concatenate([solid.vertices for solid in solids])
     return Solid(vertices, np.concatenate(faces), process=False)
+
+
+def _grown(solid: Solid, share: float) -> Solid:
+    middle = solid.bounds.mean(0)
+    vertices = middle + (solid.vertices - middle) * (1 + share)
+    return Solid(vertices, solid.faces, process=False)
 
 
 def block(low, high) -> Solid:

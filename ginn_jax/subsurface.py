@@ -4,6 +4,10 @@ The faces of material 0 enclose a homogeneous, isotropically scattering medium b
 smooth dielectric boundary. Light that enters is known by its irradiance E alone: the
 boundary refracts it as if a radiance E / pi came from everywhere. So the exitance is a
 linear function of the field of direct irradiance, which is all that a network is told.
+
+Solids that overlap are filled as one: what is inside another is no boundary, and no
+network could know of it, as only what light can reach is sampled. Light that a walk
+would meet in a cavity is direct light, so a sealed one is dark.
 """
 
 from typing import Any, NamedTuple
@@ -147,6 +151,8 @@ def _walk(
     corner = scene.mesh.vertices[scene.mesh.faces[scene.mesh.material == 0]]
     low, high = corner.min((0, 1)) - margin, corner.max((0, 1)) + margin
     low, high = mi.Point3f(opaque(low)), mi.Point3f(opaque(high))
+    solid = next(s for s in scene.handle.shapes() if s.id() == "material_0")
+    body = dr.opaque(mi.ShapePtr, solid)
 
     def event(state: tuple[Any, ...]) -> tuple[Any, ...]:
         active, _, at, toward, normal, weight, events, sampler = state
@@ -158,11 +164,14 @@ def _walk(
         met, chance = hit.is_valid(), sampler.next_1d(active)
         cosine = dr.dot(toward, hit.n)
         outer = dr.mulsign(hit.n, cosine)  # away from where the walk comes from
-        leaves = met & (chance >= mi.fresnel(dr.abs(cosine), outside)[0])
+        own = active & met & (hit.shape == body)
+        inner = _goes_on(scene, body, hit.p, outer, offset, own)
+        leaves = met & ~inner & (chance >= mi.fresnel(dr.abs(cosine), outside)[0])
         at = dr.select(met, hit.p, mi.Point3f(at + ray.maxt * toward))
-        normal = dr.select(met, outer, 0)
+        normal = dr.select(met, dr.select(inner, -outer, outer), 0)
         sphere = mi.warp.square_to_uniform_sphere(sampler.next_2d(active))
-        toward = dr.select(met, toward - 2 * cosine * hit.n, sphere)
+        back = dr.select(inner, toward, toward - 2 * cosine * hit.n)
+        toward = dr.select(met, back, sphere)
         events += 1
         escaped = ~met & ~dr.all((at >= low) & (at <= high))
         lost = escaped | (~leaves & (events >= most))
@@ -182,6 +191,30 @@ def _walk(
     state = dr.while_loop(state, lambda *s: s[0], lambda *s: event(s))
     _, lost, at, _, normal, weight, _, _ = state
     return weight, mi.Point3f(at + offset * normal), normal, lost
+
+
+def _goes_on(
+    scene: LitScene, body: Any, at: Any, outward: Any, offset: Any, active: Any
+) -> Any:
+    """Whether the medium goes on beyond its boundary, inside another of its solids.
+
+    If so, a ray outward comes to leave them once more than it enters them. Faces that
+    coincide count as one of them: solids have to overlap or be apart.
+    """
+    mi, _ = use_mitsuba()
+    import drjit as dr
+
+    def crossing(state: tuple[Any, ...]) -> tuple[Any, ...]:
+        active, at, left = state
+        ray = mi.Ray3f(at + offset * outward, outward)
+        hit = scene.handle.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
+        sign = dr.select(dr.dot(outward, hit.n) > 0, 1, -1)
+        left += dr.select(active & hit.is_valid() & (hit.shape == body), sign, 0)
+        return active & hit.is_valid() & (left <= 0), mi.Point3f(hit.p), left
+
+    state = (mi.Bool(active), mi.Point3f(at), dr.zeros(mi.Int32, dr.width(at)))
+    _, _, left = dr.while_loop(state, lambda *s: s[0], lambda *s: crossing(s))
+    return left > 0
 
 
 def _irradiance(

@@ -61,6 +61,20 @@ def test_most_of_each_family_is_seen_from_outside(name):
     assert np.mean(seen) > 0.6
 
 
+@given(hnp.arrays(float, 3, elements=st.floats(0.01, 1)), st.integers(2, 9))
+def test_solids_that_touch_come_to_overlap(size, count):
+    starts = np.arange(count)[:, None] * [size[0], 0, 0]
+    row = [solids.block(start, start + size) for start in starts]
+    parts = solids.join(row).split(only_watertight=False)
+    bounds = np.array(sorted(part.bounds.tolist() for part in parts))
+    overlap = bounds[:-1, 1, 0] - bounds[1:, 0, 0]
+    assert len(parts) == count
+    assert (overlap > 9e-5 * size[0]).all()
+    assert (overlap < 2.1e-4 * size[0]).all()
+    heights = bounds[:, 1, 1].tolist()
+    assert len(set(heights)) == count  # tops that were in one plane are apart
+
+
 @settings(max_examples=25, deadline=None)
 @given(SEED)
 def test_a_vessel_holds_more_than_its_wall_takes(seed):

@@ -110,6 +110,67 @@ def test_twice_the_light_gives_exactly_twice_the_exitance():
     np.testing.assert_array_equal(two.mean, 2 * one.mean)
 
 
+# Solids of one medium
+
+
+def boxes(*spans):
+    """A block of 1 x 1 made of boxes between these x, with walls inside it."""
+    parts = [
+        trimesh.creation.box(bounds=[(low, -0.5, -0.5), (high, 0.5, 0.5)])
+        for low, high in spans
+    ]
+    return trimesh.util.concatenate(parts)
+
+
+@pytest.mark.parametrize("extinction", [0.0, 2.0, 20.0])
+@pytest.mark.parametrize(
+    "spans",
+    [
+        [(-0.5, 0.1), (-0.1, 0.5)],
+        [(-0.5, 0.2), (-0.3, 0.4), (-0.2, 0.5), (-0.05, 0.05)],
+    ],
+    ids=["two", "four"],
+)
+def test_solids_that_overlap_are_filled_as_one(spans, extinction):
+    """What is inside another solid is no boundary: no light is lost on it."""
+    points, normals = surface(boxes((-0.5, 0.5)), 400)
+    lamp = PointLight(np.array([1.5, 1.0, 0.5]), np.array([1.0, 1.0, 1.0]))
+    one, parts = (
+        subsurface_exitance(
+            scene_of(shape, lamp),
+            medium_of((0.3, 0.6, 0.9), extinction, 1.3),
+            points,
+            normals,
+            paths=256,
+            seed=i,
+        )
+        for i, shape in enumerate((boxes((-0.5, 0.5)), boxes(*spans)))
+    )
+    (mean, sigma), (found, other) = total(one[0]), total(parts[0])
+    assert (np.abs(mean - found) < 4 * np.hypot(sigma, other)).all()
+    assert (sigma < 0.02 * mean).all()
+    assert max(one[1], parts[1]) < 1e-4
+
+
+def test_what_is_opaque_inside_a_medium_takes_light():
+    """A black ball inside a glowing one is not filled with its medium."""
+    points, normals = surface(BALL, 64)
+    core = trimesh.creation.icosphere(subdivisions=2, radius=0.3)
+    clear, dark = (
+        subsurface_exitance(
+            scene_of(BALL, constant_sky(), opaque=opaque),
+            medium_of(1, 5.0, 1.3),
+            points,
+            normals,
+            paths=256,
+            seed=11,
+        )[0]
+        for opaque in (None, core)
+    )
+    assert (total(dark)[0] < 0.8 * total(clear)[0]).all()
+    assert total(dark)[0].min() > 0.1
+
+
 # Light from one side
 
 
