@@ -1,6 +1,5 @@
 """One tiny scene is learned, by the one step that is compiled for all of this file."""
 
-from dataclasses import replace
 from functools import partial
 
 import jax
@@ -10,13 +9,9 @@ import optax
 import pytest
 import tiny
 import two_devices
-from hypothesis import given
-from hypothesis import strategies as st
 
-from ginn_jax import example, objective, train
-from ginn_jax.geometry import Geometry
+from ginn_jax import objective, train
 from ginn_jax.limits import exceeded
-from ginn_jax.receptive_field import Oriented
 
 
 def run(state, steps, data=None):
@@ -182,122 +177,3 @@ assert not report.fits and state.step == 3
 
 def test_batch_is_shared_between_devices():
     two_devices.check(TWO_DEVICES)
-
-
-def rates(config, steps):
-    """The size of each update under a constant gradient, that of a learning rate of 1.
-
-    Adam's is then 1, and Muon's as near to .2 as Newton and Schulz come to orthogonal.
-    """
-    optimizer = train.make_optimizer(config)
-    update = jax.jit(optimizer.update)
-    gradient, found = jnp.eye(4, dtype=jnp.float32), []
-    state = optimizer.init(gradient)
-    with jax.numpy_dtype_promotion("standard"):
-        for _ in range(steps):
-            change, state = update(gradient, state, gradient)
-            found.append(-float(change[0, 0]))
-    return np.array(found)
-
-
-def test_paper_schedule():
-    config = replace(
-        tiny.CONFIG, schedule="paper", learning_rate=0.005, epoch_steps=3, steps=600
-    )
-    expected = 0.005 * 0.7 ** (np.arange(95) // 30)
-    np.testing.assert_allclose(rates(config, 95), expected, rtol=1e-4)
-
-
-def test_cosine_schedule_warms_up_and_decays():
-    config = replace(tiny.CONFIG, steps=80, warm_up=20, learning_rate=0.01)
-    found = rates(config, 81)
-    # Orthogonal, with the mean square of a 4 x 4 matrix of Adam's steps of .2.
-    assert 0.7 < found.max() / (0.01 * 0.2 * np.sqrt(4)) < 1.3
-    found /= found.max()
-    np.testing.assert_allclose(found[:21], np.arange(21) / 20, atol=1e-5)
-    t = np.arange(61) / 60
-    np.testing.assert_allclose(found[20:], 0.5 * (1 + np.cos(np.pi * t)), atol=1e-5)
-
-
-def test_warm_up_fits_into_a_short_run():
-    found = rates(replace(tiny.CONFIG, steps=10, warm_up=100), 11)
-    assert np.argmax(found) == 5
-    assert found[10] < 1e-6
-
-
-@pytest.mark.parametrize("schedule", ["cosine", "paper"])
-def test_gradient_is_clipped(schedule):
-    optimizer = train.make_optimizer(replace(tiny.CONFIG, schedule=schedule))
-    gradient = {"a": jnp.float32(300), "b": jnp.float32(-400)}
-    with jax.numpy_dtype_promotion("standard"):
-        _, state = optimizer.update(gradient, optimizer.init(gradient), gradient)
-    (clipped,) = [
-        value
-        for path, value in optax.tree.get_all_with_path(state, "mu")
-        if "muon" not in str(path)
-    ]
-    np.testing.assert_allclose(clipped["a"], 0.1 * 0.6, rtol=1e-5)
-    np.testing.assert_allclose(clipped["b"], 0.1 * -0.8, rtol=1e-5)
-
-
-def test_left_over_points_carry_the_loss():
-    # 12 points: level 0 has points 0, 4 and 7; its last rows are padding.
-    mask = np.array([True, True, True, False, False])
-    level = Oriented(np.zeros((5, 3), np.float32), np.zeros((5, 3), np.float32), mask)
-    finest = jnp.array([0, 4, 7, 11, 11], jnp.int32)
-    geometry = Geometry((level,), finest, {}, None, None)
-    left_over = jax.jit(example.left_over, static_argnums=2)
-    rows, real = left_over(geometry, jnp.ones(12, bool), 3)
-    assert real.all()
-    assert rows.tolist() == [2, 6, 10]
-    rows, real = left_over(geometry, jnp.ones(12, bool), 11)
-    assert rows[real].tolist() == [1, 2, 3, 5, 6, 8, 9, 10, 11]
-    assert real.tolist() == [True] * 9 + [False] * 2
-
-
-@pytest.mark.parametrize("sparsest", [1.0, 0.1])
-def test_queries_lie_beside_the_finest_level(sparsest):
-    config = replace(tiny.CONFIG, network=tiny.ONE_LEVEL, queries=100)
-    config = replace(config, sparsest=sparsest)
-    build = partial(train.make_example, config, tiny.ONE_LEVEL_LIMITS)
-    with tiny.cheap_compiling():
-        made, _ = jax.jit(build)(tiny.batch(), key=jax.random.key(3))
-    queries, level = made.queries, made.geometry.levels[0]
-    assert queries.mask.sum() == 200
-    turned = np.array(queries.position)[:, 0] > 2
-    position = np.array(queries.position, np.float64)
-    kept = np.array(level.position)[np.array(level.mask)].astype(np.float64)
-    distance = np.linalg.norm(position[:, None] - kept, axis=-1).min(axis=1)
-    assert distance.min() > 0
-    # Of a share of the cloud, points are asked for that no Poisson disk covers.
-    assert (distance.max() < 0.08) == (sparsest == 1)
-    # Each still has its own target, wherever rotation and thinning have put it.
-    centred = position - np.outer(turned, [4, 0, 0])
-    exact = tiny.exact_openness(centred, np.array(queries.normal))
-    np.testing.assert_allclose(made.target, exact, atol=1e-4)
-
-
-@given(
-    mask=st.lists(st.booleans(), min_size=1, max_size=300),
-    sparsest=st.floats(0.05, 1.0),
-    seed=st.integers(0, 2**32 - 1),
-)
-def test_network_is_given_a_share_of_the_points(mask, sparsest, seed):
-    mask = np.array(mask)
-    key = jax.random.key(seed)
-    kept = np.array(example.given_share(jnp.array(mask), sparsest, key=key))
-    assert not (kept & ~mask).any()
-    assert (sparsest < 1) or (kept == mask).all()
-    # Eight standard deviations and more of the sparsest share.
-    least = sparsest * mask.sum() - 8 * np.sqrt(mask.sum())
-    assert kept.sum() >= least
-
-
-def test_shares_are_between_the_sparsest_and_all():
-    mask = jnp.ones(4000, bool)
-    keys = jax.random.split(jax.random.key(5), 200)
-    counts = jax.vmap(lambda key: example.given_share(mask, 0.2, key=key).mean())(keys)
-    # 200 draws of a uniform share: mean .6, deviation .016.
-    assert 0.18 < counts.min() < 0.25
-    assert 0.95 < counts.max() <= 1
-    assert abs(counts.mean() - 0.6) < 0.08
