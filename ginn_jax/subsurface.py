@@ -208,9 +208,10 @@ def _goes_on(
         active, at, left = state
         ray = mi.Ray3f(at + offset * outward, outward)
         hit = scene.handle.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
+        met = active & hit.is_valid()
         sign = dr.select(dr.dot(outward, hit.n) > 0, 1, -1)
-        left += dr.select(active & hit.is_valid() & (hit.shape == body), sign, 0)
-        return active & hit.is_valid() & (left <= 0), mi.Point3f(hit.p), left
+        left += dr.select(met & (hit.shape == body), sign, 0)
+        return met & (left <= 0), mi.Point3f(hit.p), left
 
     state = (mi.Bool(active), mi.Point3f(at), dr.zeros(mi.Int32, dr.width(at)))
     _, _, left = dr.while_loop(state, lambda *s: s[0], lambda *s: crossing(s))
