@@ -25,7 +25,7 @@ from ginn_jax.architecture import Network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
 from ginn_jax.evaluate import at_scale
-from ginn_jax.limits import Limits
+from ginn_jax.limits import Limits, only
 from ginn_jax.mesh import find_meshes
 from ginn_jax.network import Variables
 from ginn_jax.presets import compact_network
@@ -168,7 +168,7 @@ def block_memory(
     rows = blocks.BLOCK
     zeros = np.zeros((rows, 3), np.float32)
     queries = Oriented(zeros, zeros, np.ones(rows, bool))
-    flat = inference.only(limits, network.query.name)
+    flat = only(limits, network.query.name)
     turn = blocks.turn_shapes(blocks.Turn(queries))
     shared = blocks.everywhere((variables, encoded))
     lowered = inference.shade_turn.lower(network, flat, True, *shared, turn)

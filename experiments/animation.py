@@ -27,7 +27,7 @@ from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
 from ginn_jax.compare import Stage
 from ginn_jax.compare_frames import Playing, shade_next, start_playing
-from ginn_jax.compare_networks import OURS, Trained, load_networks
+from ginn_jax.compare_networks import OURS, Trained, disk_variants, load_networks
 from ginn_jax.compare_screen import screen_pictures
 from ginn_jax.compare_tracing import trace
 from ginn_jax.dataset import ShadedPoints
@@ -68,6 +68,8 @@ class Options:
     """Rays or paths per pixel of the reference."""
     draws: int = 4
     """Draws of the Poisson disks over which our network's mean is taken beside it."""
+    disks: tuple[float, ...] = (0.75,)
+    """Poisson disk radii at which our network runs beside its own, as times that."""
     points: int | None = None
     """Samples of the object and its ground; left out, 64,000 for ambient occlusion,
     32,000 for light."""
@@ -83,7 +85,7 @@ class Options:
 
 ANEW = f"{OURS}, frame by frame"
 QUICK = {"frames": 2, "resolution": 48, "reference": 8, "points": 3000, "looks": 32}
-QUICK |= {"draws": 2}
+QUICK |= {"draws": 2, "disks": ()}
 
 
 def main(options: Options) -> dict[str, Any]:
@@ -98,6 +100,7 @@ def main(options: Options) -> dict[str, Any]:
     key = jax.random.key(options.seed)
     runs = options.checkpoint, options.only_2d, options.only_3d
     networks = load_networks(options.effect, settings, runs, key=key)
+    networks |= disk_variants(networks[OURS], options.disks)
     found = {}
     with bar(console) as progress:
         total = sum(map(len, scenes.values()))

@@ -7,7 +7,6 @@ tracing and (where mitsuba_oidn is installed) denoised path tracing, on scenes t
 network was trained on. `--help` lists every option with its default.
 """
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -24,8 +23,8 @@ from ginn_jax.compare_networks import (
     NETWORKS,
     OURS,
     Trained,
-    at_disk_radius,
     codes_kept,
+    disk_variants,
     errors_at_points,
     load_networks,
     mean_picture,
@@ -214,12 +213,6 @@ def rivals(
         if denoised := denoised_picture(shot, noisy, units):
             rows.append(denoised.row)
     return rows
-
-
-def disk_variants(trained: Trained, disks: Sequence[float]) -> dict[str, Trained]:
-    """A network on finest levels of other Poisson disk radii, times that of its own."""
-    radii = [times * trained[0].levels[0] for times in disks]
-    return {f"{OURS}, disk {r:.3g}": at_disk_radius(trained, r) for r in radii}
 
 
 def summary(

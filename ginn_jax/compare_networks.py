@@ -20,11 +20,9 @@ from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model, Row, View
 from ginn_jax.inference import (
     encode_whole,
-    only,
     shade_turn,
-    without,
 )
-from ginn_jax.limits import Limits
+from ginn_jax.limits import Limits, only, without
 from ginn_jax.lit_clouds import LitCloud, mean_light, split_points
 from ginn_jax.neighbors import bucket
 from ginn_jax.objects import Source
@@ -76,6 +74,12 @@ def at_disk_radius(trained: Trained, radius: float) -> Trained:
     network, limits, model = trained
     variant = with_disk_radius(network, radius)
     return variant, limits_at(network, limits, radius), model
+
+
+def disk_variants(trained: Trained, disks: Sequence[float]) -> dict[str, Trained]:
+    """A network on finest levels of other Poisson disk radii, times that of its own."""
+    radii = [times * trained[0].levels[0] for times in disks]
+    return {f"{OURS}, disk {r:.3g}": at_disk_radius(trained, r) for r in radii}
 
 
 def redrawn(trained: Trained, draws: int) -> list[Trained]:

@@ -35,8 +35,10 @@ from ginn_jax.limits import (
     Limits,
     fitted,
     measure_limits,
+    only,
     say_raised,
     with_room,
+    without,
 )
 from ginn_jax.neighbors import bucket
 from ginn_jax.network import Variables
@@ -192,16 +194,6 @@ def check_numbers(name: str, numbers: Any, width: int, rows: int) -> None:
         raise InputError(f"{name} is {shape}, the network takes [C {rows} {width}]")
     if width and not np.isfinite(given).all():
         raise InputError(f"{name} holds non-finite numbers: remove those points")
-
-
-def only(limits: Limits, conv: str) -> Limits:
-    """The limits of one convolution: others must not make it compile again."""
-    return Limits(tuple(s for s in limits.sizes if s[0].startswith(f"{conv}.")))
-
-
-def without(limits: Limits, conv: str) -> Limits:
-    """The limits of everything else."""
-    return Limits(tuple(s for s in limits.sizes if not s[0].startswith(f"{conv}.")))
 
 
 def _shade_turns(

@@ -119,6 +119,16 @@ def largest(limits: Limits, *others: Limits) -> Limits:
     )
 
 
+def only(limits: Limits, conv: str) -> Limits:
+    """The limits of one convolution: others must not make it compile again."""
+    return Limits(tuple(s for s in limits.sizes if s[0].startswith(f"{conv}.")))
+
+
+def without(limits: Limits, conv: str) -> Limits:
+    """The limits of everything else."""
+    return Limits(tuple(s for s in limits.sizes if not s[0].startswith(f"{conv}.")))
+
+
 def widened(limits: Limits, measured: Limits, short: dict[str, int]) -> Limits:
     """Limits as large as both; where that is nothing new, raised by what was short."""
     wider = largest(limits, measured)

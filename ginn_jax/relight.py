@@ -25,8 +25,15 @@ from ginn_jax.blocks import (
 from ginn_jax.checks import unit_rows
 from ginn_jax.dataset import center_of
 from ginn_jax.geometry import Geometry, build_geometry
-from ginn_jax.inference import cloud_limits, only, query_limits, without
-from ginn_jax.limits import Demands, Limits, in_fitting_room, say_raised
+from ginn_jax.inference import cloud_limits, query_limits
+from ginn_jax.limits import (
+    Demands,
+    Limits,
+    in_fitting_room,
+    only,
+    say_raised,
+    without,
+)
 from ginn_jax.lit_clouds import LitCloud, network_numbers
 from ginn_jax.mcconv import stored_kernel
 from ginn_jax.neighbors import bucket

@@ -47,12 +47,21 @@ def tiny_networks(monkeypatch):
 @pytest.mark.parametrize("effect", ["ao", "sss"])
 def test_animation_tells_the_flicker_of_every_method(tmp_path, effect):
     options = animation.Options(
-        effect, tmp_path, frames=3, resolution=40, reference=16, points=1500, draws=2
+        effect,
+        tmp_path,
+        frames=3,
+        resolution=40,
+        reference=16,
+        points=1500,
+        draws=2,
+        disks=(0.75, 1.25),
     )
     metrics = animation.main(options)
     rows = {row["method"]: row for row in metrics["flicker"]}
     methods = {"screen space", "visibility bitmask", "ours", "2D only", "3D only"}
     methods |= {"ours, mean of 2", "ours, frame by frame"}
+    own = untrained(effect)[0].network.levels[0]
+    methods |= {f"ours, disk {times * own:.3g}" for times in options.disks}
     methods -= {"visibility bitmask"} if effect == "sss" else set()
     assert set(rows) == methods
     assert all(np.isfinite(row["flicker"]) for row in rows.values())
