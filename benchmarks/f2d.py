@@ -30,9 +30,10 @@ from ginn_jax.mesh import find_meshes
 from ginn_jax.network import Variables
 from ginn_jax.presets import compact_network
 from ginn_jax.receptive_field import Oriented
+from ginn_jax.recipe import Training
 from ginn_jax.reference import GBuffer, Scene
 from ginn_jax.searches import uniform_limits
-from ginn_jax.train import Training, init_state
+from ginn_jax.train import init_state
 
 UNSEEN_SEED = 20_000_000
 # The paper's AO, whole network, 1024 x 1024, NVIDIA GTX 1080.

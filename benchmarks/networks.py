@@ -36,8 +36,9 @@ from ginn_jax.lit_scenes import Illumination, Scattering
 from ginn_jax.objects import Source
 from ginn_jax.presets import ILLUMINATION, SCATTERING
 from ginn_jax.process import forget_programs
+from ginn_jax.recipe import Training
 from ginn_jax.room import training_room
-from ginn_jax.train import Training, init_state
+from ginn_jax.train import init_state
 
 # Steps from which the time of one is taken.
 PROBE = 30

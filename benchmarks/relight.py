@@ -26,10 +26,11 @@ from ginn_jax.evaluate import Model
 from ginn_jax.evaluate_light import encode_lit
 from ginn_jax.limits import Limits
 from ginn_jax.lit_clouds import LitCloud, network_numbers
+from ginn_jax.recipe import Training
 from ginn_jax.relight import prepare_relighting, relight
 from ginn_jax.samples import Samples
 from ginn_jax.searches import uniform_limits
-from ginn_jax.train import Training, init_state
+from ginn_jax.train import init_state
 
 UNSEEN_SEED = 20_000_000
 

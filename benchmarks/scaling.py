@@ -24,9 +24,10 @@ from ginn_jax.architecture import Network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
 from ginn_jax.presets import compact_network
+from ginn_jax.recipe import Training
 from ginn_jax.samples import sample_surface
 from ginn_jax.searches import uniform_limits
-from ginn_jax.train import Training, init_state
+from ginn_jax.train import init_state
 
 # Of the cloud under the frames.
 FRAME_POINTS = 16_000

@@ -16,7 +16,7 @@ from benchmarks.stability_stages import (
     oriented,
     row,
 )
-from ginn_jax import geometry, inference, objective, shading, train
+from ginn_jax import geometry, inference, objective, recipe, shading, train
 from ginn_jax.dataset import ShadedPoints, stack_clouds
 from ginn_jax.limits import Limits, exceeded, raise_limits
 from ginn_jax.receptive_field import Oriented
@@ -69,7 +69,7 @@ _shade = jax.jit(shading.shade, static_argnums=(0, 1))
 @cache
 def weights() -> Any:
     """Variables of the network; they do not depend on its radii."""
-    config = train.Training(small_network(), 1, batch_size=1, points=256, queries=64)
+    config = recipe.Training(small_network(), 1, batch_size=1, points=256, queries=64)
     return jax.tree.map(np.asarray, train.init_state(config).variables)
 
 
@@ -142,10 +142,10 @@ def replace_position(case: Case) -> Case:
 
 
 @cache
-def training(scale: float) -> tuple[train.Training, Limits, Any]:
+def training(scale: float) -> tuple[recipe.Training, Limits, Any]:
     """How to train, in which capacities, and the state before the first step."""
     network = small_network(scale)
-    config = train.Training(network, 10, points=1000, queries=128, warm_up=0)
+    config = recipe.Training(network, 10, points=1000, queries=128, warm_up=0)
     limits = roomy(network)
     limits = raise_limits(limits, {n: 2 * s for n, s in limits.sizes}, 1.0)
     return config, limits, jax.tree.map(np.asarray, train.init_state(config))

@@ -29,9 +29,9 @@ from ginn_jax.limits import Limits
 from ginn_jax.network import Variables
 from ginn_jax.objective import batch_loss, split_variables
 from ginn_jax.process import ALONE, available_cores
+from ginn_jax.recipe import Training
 from ginn_jax.room import training_room
 from ginn_jax.train import (
-    Training,
     TrainState,
     batch_mesh,
     init_state,

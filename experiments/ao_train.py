@@ -31,7 +31,7 @@ from ginn_jax.experiment import (
 from ginn_jax.limits import Limits
 from ginn_jax.mesh import find_meshes
 from ginn_jax.occlusion_report import write_report
-from ginn_jax.train import Training
+from ginn_jax.recipe import Training
 
 VALIDATION_RAYS = 1024
 DISK_RADII = (0.01, 0.0125, 0.015)

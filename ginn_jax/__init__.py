@@ -48,8 +48,10 @@ Modules, in the order the data flows; each imports only what stands before it:
     network           f_3D and f_2D
     example           what a training step computes before any parameter enters
     objective         what training minimises
+    recipe            how to train: sizes, schedule, optimiser
     train             one jitted step: geometry, gradient, update
     room              capacities of the steps of a run: the usual, and the most
+    run_record        what made a run, as JSON: settings and capacities
     checkpoint        saving, resuming, loading weights
     fit               the training loop of a run
     shading           f_3D of a cloud and f_2D of queries, in every colour channel
@@ -58,6 +60,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     blocks            points padded, queries in blocks for all devices
     inference         f_3D of a cloud once, f_2D at any points, sized by themselves
     image             from a G-buffer to an image
+    plans             what no light changes of f_3D and f_2D, and the rest
     relight           what does not depend on the light, kept for any light
     screen            what methods that see only the G-buffer share: its coordinates
     screen_slices     the directions round a pixel in planes through the eye

@@ -99,8 +99,6 @@ class Network:
 
     def __post_init__(self) -> None:
         """Raise `InputError` for what is no network, wherever it was read."""
-        if self.splat and self.linear:
-            raise InputError("a network that splats cannot be linear: choose one")
         if not self.levels or list(self.levels) != sorted(self.levels):
             raise InputError(f"levels {self.levels}: give at least one, finest first")
         for radius in self.levels:
@@ -114,11 +112,39 @@ class Network:
         one_of("density", self.density, ("kde", "surface"))
         one_of("norm", self.norm, ("batch", "layer", "none"))
         one_of("asks", self.asks, ("normal", "all"))
-        named = set()
+        self._check_light()
+        self._check_chain()
+
+    def _check_light(self) -> None:
+        """Raise `InputError` for what light cannot do."""
+        if self.splat and self.linear:
+            raise InputError("a network that splats cannot be linear: choose one")
+        if (self.linear or self.materials) and not self.lights:
+            raise InputError("networks that are linear or take materials take light")
         for conv in (*self.encoder, self.query):
-            least = QUERY if conv is self.query else 0
-            whole(f"source of {conv.name}", conv.source, 0, len(self.levels) - 1)
-            whole(f"target of {conv.name}", conv.target, least, len(self.levels) - 1)
+            if conv.mixes and (self.linear or self.beams):
+                raise InputError(f"{conv.name} mixes, but light passes it by itself")
+
+    def _check_chain(self) -> None:
+        """Raise `InputError` unless each convolution begins where the last one ends."""
+        level, targets = 0, dict[str, int]()
+        within = {c.source for c in self.encoder if c.source == c.target}
+        for conv in (*self.encoder, self.query):
+            name, last = conv.name, conv is self.query
+            if conv.source != level:
+                raise InputError(
+                    f"{name} begins on level {conv.source}, where the table has come "
+                    f"to {level}: let each begin where the one before ends"
+                )
+            top = QUERY if last else len(self.levels) - 1
+            whole(f"target of {name}", conv.target, QUERY if last else 0, top)
             if conv.skip is not None:
-                one_of(f"skip of {conv.name}", conv.skip, tuple(named))
-            named.add(conv.name)
+                alike = (n for n, target in targets.items() if target == conv.target)
+                one_of(f"skip of {name}", conv.skip, tuple(alike))
+            if name in targets:
+                raise InputError(f"two convolutions are called {name}: rename one")
+            if self.density == "surface" and level > 0 and level not in within:
+                raise InputError(f"no convolution within level {level} gives its areas")
+            level = targets[name] = conv.target
+        if self.query.source != 0:
+            raise InputError("f_2D asks of level 0: let the encoder end there")

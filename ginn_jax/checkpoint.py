@@ -1,10 +1,8 @@
-"""Saving and resuming a training run: orbax for the state, JSON for what made it."""
+"""The state of a training run on disk, by orbax: saved, resumed, read by others."""
 
-import json
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,20 +11,23 @@ import jax
 import orbax.checkpoint as ocp
 from jax.sharding import SingleDeviceSharding
 
-from ginn_jax.architecture import Conv, Network
-from ginn_jax.checks import LARGEST_INDEX, whole
 from ginn_jax.errors import InputError
-from ginn_jax.files import unwritable, writing
+from ginn_jax.files import unwritable
 from ginn_jax.limits import Limits
 from ginn_jax.network import Variables
-from ginn_jax.room import Room
-from ginn_jax.searches import limit_names
-from ginn_jax.train import Training, TrainState, state_shapes
+from ginn_jax.recipe import Training
+from ginn_jax.run_record import (
+    RECORD,
+    check_names,
+    damaged,
+    limits_from,
+    read_record,
+    training_from,
+)
+from ginn_jax.train import TrainState, state_shapes
 
 KEPT = 2
-CHECKPOINTS, RECORD = "checkpoints", "run.json"
-OLD = "{} is of another version of ginn_jax: train again"
-UNSPENT = {"compile": 0.0, "train": 0.0}
+CHECKPOINTS = "checkpoints"
 
 
 def open_manager(folder: Path, fresh: bool = False) -> ocp.CheckpointManager:
@@ -34,17 +35,31 @@ def open_manager(folder: Path, fresh: bool = False) -> ocp.CheckpointManager:
 
     `fresh` removes those of an earlier run.
     """
-    path = (folder / CHECKPOINTS).absolute()
+    path = folder / CHECKPOINTS
     options = ocp.CheckpointManagerOptions(
         max_to_keep=KEPT, create=True, cleanup_tmp_directories=True
     )
     try:
         if fresh and path.exists():
             shutil.rmtree(path)
-        handler = ocp.StandardCheckpointHandler()
-        return ocp.CheckpointManager(path, options=options, item_handlers=handler)
+        return _manager(path, options)
     except OSError as error:
-        raise InputError(unwritable(path, error)) from None
+        raise InputError(unwritable(path.absolute(), error)) from None
+
+
+def open_reader(folder: Path) -> ocp.CheckpointManager:
+    """The checkpoints of a run that may be writing one just now: nothing is changed."""
+    options = ocp.CheckpointManagerOptions(
+        read_only=True, create=False, save_interval_steps=0
+    )
+    return _manager(folder / CHECKPOINTS, options)
+
+
+def _manager(path: Path, options: ocp.CheckpointManagerOptions) -> Any:
+    handler = ocp.StandardCheckpointHandler()
+    return ocp.CheckpointManager(
+        path.absolute(), options=options, item_handlers=handler
+    )
 
 
 def save_state(manager: ocp.CheckpointManager, state: TrainState) -> None:
@@ -125,60 +140,6 @@ def _shape_of(leaf: Any) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding)
 
 
-def save_run(
-    folder: Path,
-    config: Training,
-    room: Room,
-    extra: dict[str, Any],
-    seconds: Mapping[str, float] = UNSPENT,
-) -> None:
-    """Write what a resumed run must agree with, its capacities and the time spent."""
-    record = {"training": asdict(config), "seconds": dict(seconds), **extra}
-    record |= {"limits": dict(room.most.sizes), "usual": dict(room.usual.sizes)}
-    text = json.dumps(record, indent=1, sort_keys=True)
-    with writing(folder / RECORD) as new:
-        new.write_text(text)
-
-
-def load_run(
-    folder: Path, config: Training, extra: dict[str, Any]
-) -> tuple[Room, dict[str, float]]:
-    """Capacities of the run to be resumed, and the seconds it took by purpose.
-
-    Raises:
-        InputError: no run there, an unreadable record, or other settings than now.
-    """
-    path = folder / RECORD
-    record = read_record(path, "no run to resume: leave out --resume")
-    if isinstance(record, dict) and "limits" in record and "usual" not in record:
-        raise InputError(OLD.format(path))
-    with damaged(path, "delete it and start anew"):
-        training = dict(record["training"])
-        room = Room(limits_from(record, "usual"), limits_from(record))
-        spent = record.get("seconds", UNSPENT)
-        seconds = {name: float(spent[name]) for name in UNSPENT}
-    wanted = json.loads(json.dumps({"training": asdict(config), **extra}))
-    for name in sorted(wanted["training"]):
-        if training.get(name) != wanted["training"][name]:
-            raise InputError(
-                f"{path} was made with another {name}: resume with the same"
-            )
-    for name in sorted(extra):
-        if record.get(name) != wanted[name]:
-            raise InputError(
-                f"{path} was made with another {name}: resume with the same"
-            )
-    for limits in room.each():
-        check_names(path, config.network, limits)
-    return room, seconds
-
-
-def check_names(path: Path, network: Network, limits: Limits) -> None:
-    """Raise `InputError` unless these are the capacities that the network needs."""
-    if {name for name, _ in limits.sizes} != set(limit_names(network)):
-        raise InputError(OLD.format(path))
-
-
 def load_weights(folder: Path) -> tuple[Training, Limits, Variables]:
     """What a finished run in `folder` trained: its configuration, capacities, weights.
 
@@ -200,49 +161,8 @@ def load_weights(folder: Path) -> tuple[Training, Limits, Variables]:
         lambda s: jax.ShapeDtypeStruct(s.shape, s.dtype, sharding=here),
         state_shapes(config),
     )
-    with closing(open_manager(folder)) as manager:
+    with closing(open_reader(folder)) as manager:
         state = restore_state(manager, like)
     if state is None:
         raise InputError(f"{folder} holds no checkpoint yet: let its run go on")
     return config, limits, state.variables
-
-
-def read_record(path: Path, missing: str) -> Any:
-    """What `save_run` wrote; None where that is not JSON."""
-    try:
-        with open(path, "rb") as file:
-            if file.read(1) != b"{":
-                return None
-            return json.loads(b"{" + file.read())
-    except FileNotFoundError:
-        raise InputError(f"{path.parent} holds {missing}") from None
-    except OSError as error:
-        raise InputError(
-            f"{path} cannot be read ({error.strerror}): mend that or choose another"
-        ) from None
-    except (ValueError, RecursionError):
-        return None
-
-
-@contextmanager
-def damaged(path: Path, mend: str) -> Iterator[None]:
-    """Say of a record without what should be in it that it is damaged."""
-    try:
-        yield
-    except (ValueError, KeyError, AttributeError, TypeError, OverflowError):
-        raise InputError(f"{path} is damaged: {mend}") from None
-
-
-def limits_from(record: dict[str, Any], name: str = "limits") -> Limits:
-    """The capacities that `save_run` wrote."""
-    sizes = record[name].items()
-    return Limits(tuple((name, whole(name, n, 1, LARGEST_INDEX)) for name, n in sizes))
-
-
-def training_from(record: dict[str, Any]) -> Training:
-    """The configuration that `save_run` wrote."""
-    network = dict(record["network"])
-    network["levels"] = tuple(network["levels"])
-    network["encoder"] = tuple(Conv(**row) for row in network["encoder"])
-    network["query"] = Conv(**network["query"])
-    return Training(**{**record, "network": Network(**network)})

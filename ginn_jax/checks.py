@@ -73,9 +73,34 @@ def unit_rows(points: Any, normals: Any, what: str = "points") -> None:
         raise InputError(
             f"{what} {points.shape} and normals {normals.shape} must both be [N, 3]"
         )
-    if not np.isfinite(points).all():
+    if not np.all(np.abs(points) <= LARGEST):
         raise InputError(f"{what} holds non-finite numbers: drop those rows")
     if not np.all(np.abs(np.einsum("ij,ij->i", normals, normals) - 1) < 2e-3):
         raise InputError(
             "normals are non-finite or not of unit length: divide them by their length"
+        )
+
+
+def numbers_of(
+    name: str, value: Any, width: int, rows: int, least: float = -LARGEST
+) -> None:
+    """So many finite numbers for each of these points, in channels; None for none."""
+    if width == 0 and value is not None:
+        raise InputError(f"the network takes no {name}: leave it out")
+    array = real_array(name, () if value is None else value)
+    shape = array.shape
+    if width and (len(shape) != 3 or shape[1:] != (rows, width) or not shape[0]):
+        raise InputError(f"{name} is {shape}, the network takes [C {rows} {width}]")
+    if not np.all(np.abs(array) <= LARGEST):
+        raise InputError(f"{name} holds non-finite numbers: remove those points")
+    if not np.all(array >= least):
+        raise InputError(f"{name} holds numbers below {least:g}: remove those points")
+
+
+def channels_alike(*arrays: Any) -> None:
+    """As many channels in everything that has some."""
+    counts = sorted({np.shape(a)[0] for a in arrays if a is not None})
+    if len(counts) > 1:
+        raise InputError(
+            f"light, material and codes have {counts} channels: give all the same"
         )

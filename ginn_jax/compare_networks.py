@@ -12,22 +12,19 @@ from jaxtyping import Array, Float, Key
 from ginn_jax import evaluate, evaluate_light
 from ginn_jax.architecture import Network
 from ginn_jax.blocks import Turn, largest_block, turn_shapes
-from ginn_jax.checkpoint import RECORD, damaged, read_record
 from ginn_jax.compare import Picture, Shot, errors, of_variance, scratch_mib
 from ginn_jax.dataset import ShadedPoints, count_given
 from ginn_jax.disk_radius import limits_at, with_disk_radius
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model, Row, View
-from ginn_jax.inference import (
-    encode_whole,
-    shade_turn,
-)
+from ginn_jax.inference import encode_whole, shade_turn
 from ginn_jax.limits import Limits, only, without
 from ginn_jax.lit_clouds import LitCloud, mean_light, split_points
 from ginn_jax.neighbors import bucket
 from ginn_jax.objects import Source
 from ginn_jax.pretrained import load_manifest, load_network
 from ginn_jax.receptive_field import Oriented
+from ginn_jax.run_record import RECORD, damaged, read_record
 from ginn_jax.scenes import Occlusion, Settings
 
 Trained = tuple[Network, Limits, Model]

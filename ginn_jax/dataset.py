@@ -107,22 +107,27 @@ def check_rows(columns: dict[str, Any], widths: dict[str, int]) -> None:
             raise ValueError(name)
 
 
-def load_arrays(path: Path, origin: dict[str, Any] | None) -> dict[str, np.ndarray]:
-    """Read named arrays back; `InputError` as in `load_cloud`."""
+def load_arrays(
+    path: Path,
+    origin: dict[str, Any] | None,
+    mend: str = "delete it to have it made again",
+) -> dict[str, np.ndarray]:
+    """Read named arrays back; `InputError` as in `load_cloud`.
+
+    `mend` is what helps where the file is damaged.
+    """
     try:
         with np.load(path, allow_pickle=False) as file:
             found = json.loads(str(file["origin"]))
             arrays = {name: file[name] for name in file.files if name != "origin"}
     except FileNotFoundError:
-        raise InputError(f"{path}: no such cloud") from None
+        raise InputError(f"{path}: no such file") from None
     except (PermissionError, IsADirectoryError) as error:
         raise InputError(
             f"{path} cannot be read ({error.strerror}): mend that or choose another"
         ) from None
     except Exception:  # zipfile, zlib, NumPy and json each raise what they like
-        raise InputError(
-            f"{path} is damaged: delete it to have it made again"
-        ) from None
+        raise InputError(f"{path} is damaged: {mend}") from None
     if origin is not None and found != json.loads(json.dumps(origin)):
         raise InputError(f"{path} was made with other settings: choose another folder")
     return arrays

@@ -25,7 +25,7 @@ from ginn_jax.lit_clouds import Cloud
 from ginn_jax.objects import SEEDS_APART, UNSEEN_SEED, Source
 from ginn_jax.pretrained import load_any, starting_weights
 from ginn_jax.process import available_cores, forget_programs
-from ginn_jax.train import Training
+from ginn_jax.recipe import Training
 from ginn_jax.upsample import shading_step
 
 

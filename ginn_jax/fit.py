@@ -13,12 +13,9 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from ginn_jax.checkpoint import (
-    UNSPENT,
     finish,
-    load_run,
     open_manager,
     restore_state,
-    save_run,
     save_state,
 )
 from ginn_jax.dataset import ShadedPoints, batch_order, stack_clouds
@@ -28,13 +25,10 @@ from ginn_jax.limits import Limits, exceeded
 from ginn_jax.lit_clouds import Cloud, channel_of
 from ginn_jax.network import Variables
 from ginn_jax.process import forget_programs
+from ginn_jax.recipe import Training
 from ginn_jax.room import Room, training_room, with_more
-from ginn_jax.train import (
-    Training,
-    TrainState,
-    init_state,
-    train_step,
-)
+from ginn_jax.run_record import UNSPENT, load_run, save_run
+from ginn_jax.train import StepReport, TrainState, init_state, train_step
 
 
 @dataclass(frozen=True)
@@ -77,7 +71,7 @@ def fit(
     on the state it started from. `progress(step, loss, note)` hears of every report.
 
     Raises:
-        InputError: too few points per cloud, or nothing to resume.
+        InputError: clouds of too few points or of unequal size, or nothing to resume.
     """
     _check(config, clouds)
     folder.mkdir(parents=True, exist_ok=True)
@@ -136,6 +130,7 @@ def step_with_room(
     for limits in room.each():
         state, report = train_step(config, limits, state, batch)
         if not (short := exceeded(limits, jax.device_get(report.demands))):
+            _check_asked(step, report)
             return state, float(report.loss), limits, room
     return state, math.nan, None, with_more(room, config, batch, step, short)
 
@@ -176,10 +171,24 @@ def step_batch(config: Training, clouds: Sequence[Cloud], step: int) -> ShadedPo
     )
 
 
+def _check_asked(step: int, report: StepReport) -> None:
+    if not int(report.asked):
+        raise InputError(
+            f"step {step} has no points left to ask for: all are in level 0; sample "
+            "more, raise the finest level, or set sparsest below 1"
+        )
+
+
 def _check(config: Training, clouds: Sequence[Cloud]) -> None:
     if not clouds:
         raise InputError("no training clouds: ask for at least one shape")
-    fewest = min(len(c.position) for c in clouds)
+    sizes = {len(c.position) for c in clouds}
+    fewest = min(sizes)
+    if len(sizes) > 1:
+        raise InputError(
+            f"training clouds have from {fewest} to {max(sizes)} points: cut them to "
+            "the same number"
+        )
     if fewest < config.points:
         raise InputError(
             f"a training cloud has {fewest} points, a step takes {config.points}: "

@@ -80,6 +80,12 @@ def shade_image(
     step = shading_step(resolution_scale)
     surface = Surface(*map(np.asarray, (position, normal, mask)))
     numbers = numbers_asked(network, material, light)
+    for name, given in zip(("material", "light"), numbers, strict=True):
+        if given is not None and np.shape(given)[1:-1] != surface.mask.shape:
+            raise InputError(
+                f"{name} {np.shape(given)} does not fit the mask {surface.mask.shape}: "
+                "give [C H W numbers]"
+            )
     channels = () if encoded.scale is None else encoded.scale.shape
     values = np.full((*surface.mask.shape, *channels), background, np.float32)
     shade = partial(_shade_pixels, network, variables, encoded)

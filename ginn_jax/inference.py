@@ -25,7 +25,7 @@ from ginn_jax.blocks import (
     pad_channels,
     pad_points,
 )
-from ginn_jax.checks import real_array, unit_rows
+from ginn_jax.checks import channels_alike, numbers_of, unit_rows
 from ginn_jax.dataset import center_of
 from ginn_jax.errors import InputError
 from ginn_jax.example import numbers_asked
@@ -108,14 +108,15 @@ def encode_cloud(
 
     Raises:
         InputError: an empty cloud, or one that is not finite; normals that are not of
-            unit length; material or light that the network does not take; or
-            `kept_before` of another cloud.
+            unit length; material or light that the network does not take, or in other
+            channels than each other; light below 0; or `kept_before` of another cloud.
     """
     if not np.size(position):
         raise InputError("the cloud is empty: sample at least one point")
     unit_rows(position, normal, "the cloud")
-    check_numbers("material", material, network.materials, len(position))
-    check_numbers("light", light, network.lights, len(position))
+    numbers_of("material", material, network.materials, len(position))
+    numbers_of("light", light, network.lights, len(position), least=0.0)
+    channels_alike(material, light)
     rows = bucket(len(position))
     check_kept(kept_before, (len(network.levels), rows))
     center = center_of(position)
@@ -184,18 +185,6 @@ def query_limits(
     return measure_limits(only(ample, network.query.name), probe, len(turns), SLACK)
 
 
-def check_numbers(name: str, numbers: Any, width: int, rows: int) -> None:
-    """Raise `InputError` unless so many numbers come with each of these points."""
-    if width == 0 and numbers is not None:
-        raise InputError(f"the network takes no {name}: leave it out")
-    given = real_array(name, () if numbers is None else numbers)
-    shape = given.shape
-    if width and (len(shape) != 3 or shape[1:] != (rows, width)):
-        raise InputError(f"{name} is {shape}, the network takes [C {rows} {width}]")
-    if width and not np.isfinite(given).all():
-        raise InputError(f"{name} holds non-finite numbers: remove those points")
-
-
 def _shade_turns(
     network: Network,
     variables: Variables,
@@ -233,8 +222,9 @@ def shade_points(
     """
     unit_rows(position, normal)
     if network.asks == "all":
-        check_numbers("material", material, network.materials, len(position))
-        check_numbers("light", light, network.lights, len(position))
+        numbers_of("material", material, network.materials, len(position))
+        numbers_of("light", light, network.lights, len(position), least=0.0)
+        channels_alike(encoded.scale, material, light)
     size = block_size(len(position), encoded.scale is not None)
     queries = in_turns(encoded.center, position, normal, size)
     asked = numbers_asked(network, material, light)

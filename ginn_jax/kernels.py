@@ -22,6 +22,9 @@ class Kernel(NamedTuple):
     b3: Float[Array, "G K"]
 
 
+BIASES = ("b1", "b2", "b3")
+
+
 def init_kernel(
     inputs: int, outputs: int, hidden: int, group: int, *, key: Key[Array, ""]
 ) -> Kernel:

@@ -164,7 +164,11 @@ def raise_limits(limits: Limits, demands: dict[str, int], slack: float) -> Limit
 
 
 def round_up(count: int) -> int:
-    """A capacity with at most 1/16 to spare, so that few shapes are compiled."""
+    """A capacity with at most 1/16 to spare, so that few shapes are compiled.
+
+    Of what is not needed at all too: arrays of no rows cannot be gathered from.
+    """
+    count = max(count, 1)
     step = 1 << max(count.bit_length() - 4, 6)
     return -(-count // step) * step
 

@@ -43,7 +43,7 @@ from ginn_jax.objects import (
     procedural_sources,
     split_apart,
 )
-from ginn_jax.train import Training
+from ginn_jax.recipe import Training
 
 VALIDATION_PATHS = 512
 PATH_COUNTS = (1, 4, 16, 64)

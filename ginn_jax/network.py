@@ -192,9 +192,9 @@ class Shader(nn.Module):
         light: Float[Array, "M L"] | None,
         mask: Bool[Array, "M"],
         field: Field,
+        senders: Bool[Array, "N"],
     ) -> Float[Array, "M"]:
         network = self.network
-        senders = jnp.ones(code.free.shape[0], bool)
         if network.splat:
             free = nn.Dense(network.head)(code.free)
             free = Norm(network.norm, self.train)(free, senders)

@@ -23,6 +23,7 @@ def infer(
         *example.asked,
         example.queries.mask,
         example.field,
+        example.geometry.levels[0].mask,
         mutable=["batch_stats"],
     )
     return values, {"encoder": moments_3d, "shader": moments_2d}
@@ -36,8 +37,9 @@ def init_variables(
     code, encoder = Encoder(network, True).init_with_output(
         encoder_key, *example.given, example.geometry
     )
+    senders = example.geometry.levels[0].mask
     shader = Shader(network, True).init(
-        shader_key, code, *example.asked, example.queries.mask, example.field
+        shader_key, code, *example.asked, example.queries.mask, example.field, senders
     )
     return {"encoder": encoder, "shader": shader}
 

@@ -11,20 +11,21 @@ from typing import Any
 import jax
 import numpy as np
 
-from ginn_jax.checkpoint import (
-    check_names,
-    damaged,
-    limits_from,
-    load_weights,
-    read_record,
-    training_from,
-)
+from ginn_jax.checkpoint import load_weights
 from ginn_jax.dataset import load_arrays, save_arrays
 from ginn_jax.errors import InputError
 from ginn_jax.files import writing
 from ginn_jax.limits import Limits
 from ginn_jax.network import Variables
-from ginn_jax.train import Training, state_shapes
+from ginn_jax.recipe import Training
+from ginn_jax.run_record import (
+    check_names,
+    damaged,
+    limits_from,
+    read_record,
+    training_from,
+)
+from ginn_jax.train import state_shapes
 
 FOLDER = Path(__file__).parent / "weights"
 MANIFEST = "manifest.json"
@@ -97,7 +98,7 @@ def read_weights(path: Path, config: Training) -> Variables:
     Raises:
         InputError: a missing or damaged file, or one of another network.
     """
-    found = load_arrays(path, None)
+    found = load_arrays(path, None, "install the package again")
     leaves, tree = jax.tree.flatten_with_path(state_shapes(config).variables)
     wanted = {place(keys): leaf.shape for keys, leaf in leaves}
     if wanted != {name: array.shape for name, array in found.items()}:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Key
 
 from ginn_jax.architecture import Network
 from ginn_jax.blocks import (
@@ -22,9 +22,9 @@ from ginn_jax.blocks import (
     pad_channels,
     pad_points,
 )
-from ginn_jax.checks import unit_rows
+from ginn_jax.checks import numbers_of, unit_rows
 from ginn_jax.dataset import center_of
-from ginn_jax.geometry import Geometry, build_geometry
+from ginn_jax.errors import InputError
 from ginn_jax.inference import cloud_limits, query_limits
 from ginn_jax.limits import (
     Demands,
@@ -35,34 +35,18 @@ from ginn_jax.limits import (
     without,
 )
 from ginn_jax.lit_clouds import LitCloud, network_numbers
-from ginn_jax.mcconv import stored_kernel
 from ginn_jax.neighbors import bucket
-from ginn_jax.network import STORED, Code, Variables
-from ginn_jax.process import ALONE
-from ginn_jax.receptive_field import Oriented, in_coherent_order
-from ginn_jax.shading import (
-    Asking,
-    Searched,
-    encode_channels,
-    search_queries,
-    shade_channels,
+from ginn_jax.network import Variables
+from ginn_jax.plans import (
+    QueryPlan,
+    ScenePlan,
+    encode_planned,
+    plan_queries,
+    plan_scene,
+    shade_planned,
 )
-
-
-class ScenePlan(NamedTuple):
-    """f_3D for any light: geometry, kernel values, and how the cloud was sorted."""
-
-    geometry: Geometry
-    stored: dict[str, Any]
-    order: Int[Array, "N"]
-    mask: Bool[Array, "N"]
-
-
-class QueryPlan(NamedTuple):
-    """f_2D of one block of queries for any light: geometry and kernel values."""
-
-    asking: Asking
-    stored: dict[str, Any]
+from ginn_jax.process import ALONE
+from ginn_jax.receptive_field import Oriented
 
 
 class Relightable(NamedTuple):
@@ -70,73 +54,6 @@ class Relightable(NamedTuple):
 
     scene: ScenePlan
     turns: tuple[QueryPlan, ...]
-
-
-def plan_scene(
-    network: Network,
-    limits: Limits,
-    variables: Variables,
-    cloud: Oriented,
-    key: Key[Array, ""],
-) -> tuple[ScenePlan, Demands]:
-    """All of f_3D that does not depend on the light."""
-    mask = cloud.mask
-    cloud, order = in_coherent_order(cloud)
-    geometry, demands = build_geometry(network, limits, cloud, order, key=key)
-    weights = variables["encoder"]["params"]
-    stored = {
-        name: {"kernel": stored_kernel(weights[name]["kernel"], field)}
-        for name, field in geometry.fields.items()
-    }
-    return ScenePlan(geometry, stored, order, mask), demands
-
-
-def plan_queries(
-    network: Network,
-    limits: Limits,
-    variables: Variables,
-    searched: Searched,
-    queries: Oriented,
-) -> tuple[QueryPlan, Demands]:
-    """All of f_2D, for one block of queries, that does not depend on the light."""
-    queries, order = in_coherent_order(queries)
-    asking, demands = search_queries(network, limits, searched, queries, order)
-    name, weights = network.query.name, variables["shader"]["params"]
-    stored = {}
-    if not network.splat:
-        stored[name] = {"kernel": stored_kernel(weights[name]["kernel"], asking.field)}
-    return QueryPlan(asking, stored), demands
-
-
-def encode_planned(
-    network: Network,
-    variables: Variables,
-    plan: ScenePlan,
-    material: Float[Array, "C N A"],
-    light: Float[Array, "C N L"],
-) -> tuple[Code, Float[Array, "C"], Float[Array, "C N L"] | None]:
-    """f_3D of a light, its unit and, where facets are smoothed, all of it in order."""
-    ready = {"encoder": variables["encoder"] | {STORED: plan.stored}}
-    ends = plan.geometry, plan.order, plan.mask
-    code, scale = encode_channels(network, ready, *ends, material, light)
-    assert scale is not None
-    return code, scale, light[:, plan.order] if plan.geometry.around else None
-
-
-def shade_planned(
-    network: Network,
-    variables: Variables,
-    plan: QueryPlan,
-    code: Code,
-    scale: Float[Array, "C"],
-    around: Float[Array, "C N L"] | None,
-    material: Float[Array, "C M A"] | None,
-    light: Float[Array, "C M L"] | None,
-) -> Float[Array, "C M"]:
-    """f_2D of a light at one block of queries."""
-    ready = {"shader": variables["shader"] | {STORED: plan.stored}}
-    lit = code, scale, around
-    return shade_channels(network, ready, plan.asking, *lit, material, light)
 
 
 _plan_scene = jax.jit(plan_scene, static_argnums=(0, 1))
@@ -178,8 +95,14 @@ def prepare_relighting(
 ) -> tuple[Relightable, Limits]:
     """A cloud and queries made ready for any light; the limits that sufficed.
 
-    Raises `InputError` for points that are not finite or normals not of unit length.
+    Raises:
+        InputError: an empty cloud, points that are not finite, normals not of unit
+            length, or a network that takes no light.
     """
+    if not network.lights:
+        raise InputError("the network takes no light: give one of gi or sss")
+    if not len(cloud.position):
+        raise InputError("the cloud is empty: sample at least one point")
     unit_rows(cloud.position, cloud.normal, "the cloud")
     unit_rows(queries.position, queries.normal, "queries")
     center = center_of(cloud.position)
@@ -221,14 +144,33 @@ def relight(
     """Values at the queries under the light that `cloud` and `queries` now carry.
 
     Positions and normals must be those that were prepared; material may change.
+
+    Raises:
+        InputError: another number of points, or material or light as `encode_cloud`.
     """
-    rows = bucket(len(cloud.position))
-    numbers = (pad_channels(a, rows) for a in network_numbers(cloud))
+    check_prepared("the cloud", cloud, ready.scene.mask)
+    given, count = network_numbers(cloud), len(cloud.position)
+    numbers_of("material", given[0], network.materials, count)
+    numbers_of("light", given[1], network.lights, count, least=0.0)
+    numbers = (pad_channels(a, bucket(count)) for a in given)
     lit = _encode_planned(network, variables, ready.scene, *numbers)
     shared = everywhere(({"shader": variables["shader"]}, lit))
+    check_prepared("queries", queries, *(t.asking.queries.mask for t in ready.turns))
     size = block_size(len(queries.position), lit=True)
     asked = network_numbers(queries) if network.asks == "all" else (None, None)
     own = (channels_in_turns(a, size, len(ready.turns)) for a in asked)
     turns = zip(ready.turns, *own, strict=True)
-    values = in_rows([_shade_turn(network, shared, turn) for turn in turns])
-    return np.maximum(values[: len(queries.position)], 0.0)
+    values = [_shade_turn(network, shared, turn) for turn in turns]
+    if not values:
+        return np.zeros((0, 3), np.float32)
+    return np.maximum(in_rows(values)[: len(queries.position)], 0.0)
+
+
+def check_prepared(what: str, points: LitCloud, *masks: Bool[Array, "_ *_"]) -> None:
+    """Raise `InputError` unless these are as many points as were prepared."""
+    prepared = sum(int(np.sum(mask)) for mask in masks)
+    if len(points.position) != prepared:
+        raise InputError(
+            f"{what} has {len(points.position)} points, {prepared} were prepared: "
+            "prepare them anew"
+        )

@@ -23,8 +23,9 @@ from ginn_jax.limits import (
     widened,
 )
 from ginn_jax.lit_clouds import Cloud, channel_of
+from ginn_jax.recipe import Training
 from ginn_jax.searches import uniform_limits
-from ginn_jax.train import Training, batch_mesh, probe_step, share_key
+from ginn_jax.train import batch_mesh, probe_step, share_key
 
 # Batches that are probed before a run at the most.
 PROBES = 300

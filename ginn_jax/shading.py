@@ -216,8 +216,10 @@ def shade_channels(
         numbers = real_rows((material, light), queries.mask)
         asked = queries_asked(network, queries, *numbers)
         shader = Shader(network, train=False)
+        # Running moments do not ask which points are real.
+        senders = jnp.ones(code.free.shape[0], bool)
         values: Any = shader.apply(
-            variables["shader"], code, *asked, queries.mask, field
+            variables["shader"], code, *asked, queries.mask, field, senders
         )
         if order is not None:
             values = jnp.zeros_like(values).at[order].set(values)

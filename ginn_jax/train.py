@@ -4,7 +4,6 @@ The step draws rotations, thins the clouds, builds the hierarchy, searches, weig
 convolves, differentiates and updates. A batch is shared out between the devices.
 """
 
-from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any, NamedTuple
 
@@ -16,49 +15,14 @@ from jax.sharding import Mesh as DeviceMesh
 from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from ginn_jax.architecture import Network
-from ginn_jax.checks import LARGEST_INDEX, LARGEST_SEED, one_of, positive, whole
 from ginn_jax.dataset import ShadedPoints
 from ginn_jax.example import Example, thin_and_search
 from ginn_jax.limits import Demands, Limits, fits
 from ginn_jax.network import Variables
 from ginn_jax.objective import batch_loss, init_variables, split_variables
 from ginn_jax.process import ALONE
+from ginn_jax.recipe import Training, make_optimizer
 from ginn_jax.searches import uniform_limits
-
-
-@dataclass(frozen=True)
-class Training:
-    """How to train.
-
-    `points` of every cloud are taken for a step, and the network is given a share of
-    them drawn between `sparsest` and 1; `queries` of those that this and Poisson disk
-    sampling leave over carry the loss. Schedule "cosine" is of Muon, warms up and
-    decays to zero over `steps`; "paper" is of Adam, times 0.7 every 10 epochs.
-    """
-
-    network: Network
-    steps: int
-    batch_size: int = 2
-    points: int = 16384
-    queries: int = 4096
-    sparsest: float = 1.0
-    learning_rate: float = 0.01
-    schedule: str = "cosine"
-    warm_up: int = 100
-    clip_norm: float = 1.0
-    epoch_steps: int = 1
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "batch_size", "points", "queries", "epoch_steps"):
-            whole(name, getattr(self, name), 1, LARGEST_INDEX)
-        whole("warm_up", self.warm_up, 0, LARGEST_INDEX)
-        whole("seed", self.seed, 0, LARGEST_SEED)
-        positive("learning_rate", self.learning_rate)
-        positive("clip_norm", self.clip_norm)
-        positive("sparsest", self.sparsest, 1.0)
-        one_of("schedule", self.schedule, ("cosine", "paper"))
 
 
 class TrainState(NamedTuple):
@@ -71,48 +35,16 @@ class TrainState(NamedTuple):
 
 
 class StepReport(NamedTuple):
-    """What a step says of itself; `fits` is False where a limit was too small."""
+    """What a step says of itself; `fits` is False where a limit was too small.
+
+    `asked` counts the queries that carried the loss.
+    """
 
     loss: Float[Array, ""]
     gradient_norm: Float[Array, ""]
     fits: Bool[Array, ""]
+    asked: Int[Array, ""]
     demands: Demands
-
-
-def make_optimizer(config: Training) -> optax.GradientTransformation:
-    """Muon, or for schedule "paper" Adam, with clipped gradients.
-
-    Muon makes the step of every matrix orthogonal, so that what few clouds ask of a
-    layer is learned as fast as what all ask, and leaves the rest to Adam (Jordan 2024;
-    in the root mean square of Adam's steps: Liu et al. 2025).
-    """
-    clip = optax.clip_by_global_norm(config.clip_norm)
-    if config.schedule == "paper":
-        rate = optax.exponential_decay(
-            config.learning_rate, 10 * config.epoch_steps, 0.7, staircase=True
-        )
-        return optax.chain(clip, optax.adam(rate))
-    rate = optax.warmup_cosine_decay_schedule(
-        0.0,
-        config.learning_rate,
-        min(config.warm_up, config.steps // 2),
-        config.steps,
-    )
-    muon = optax.contrib.muon(
-        rate, consistent_rms=0.2, muon_weight_dimension_numbers=_matrices
-    )
-    return optax.chain(clip, muon)
-
-
-def _matrices(params: Any) -> Any:
-    """The last two axes of weights that have them, those of kernel blocks too."""
-
-    def matrix(weights: Any) -> Any:
-        least = min(weights.shape[-2:], default=0) if weights.ndim > 1 else 0
-        axes = optax.contrib.MuonDimensionNumbers(weights.ndim - 2, weights.ndim - 1)
-        return axes if least > 1 else None
-
-    return jax.tree.map(matrix, params)
 
 
 def batch_mesh(batch_size: int) -> DeviceMesh:
@@ -129,8 +61,8 @@ def _share_gradient(
     moments: Variables,
     key: Key[Array, ""],
     batch: ShadedPoints,
-) -> tuple[Variables, Variables, Array, Demands]:
-    """Gradient, moments, loss and demands, averaged or maximised over the devices."""
+) -> tuple[Variables, Variables, Array, Array, Demands]:
+    """Gradient, moments and loss, averaged over the devices, queries and demands."""
     key = jax.random.fold_in(key, jax.lax.axis_index("batch"))
     example, demands = make_example(config, limits, batch, key=key)
     example = jax.lax.optimization_barrier(example)
@@ -139,7 +71,8 @@ def _share_gradient(
     )
     mean = partial(jax.lax.pmean, axis_name="batch")
     gradient, moments, loss = jax.tree.map(mean, (gradient, moments, loss))
-    return gradient, moments, loss, jax.lax.pmax(demands, "batch")
+    asked = jax.lax.psum(jnp.sum(example.queries.mask, dtype=jnp.int32), "batch")
+    return gradient, moments, loss, asked, jax.lax.pmax(demands, "batch")
 
 
 @partial(jax.jit, static_argnums=(0, 1), donate_argnums=2, compiler_options=ALONE)
@@ -154,7 +87,7 @@ def train_step(
     key = jax.random.fold_in(jax.random.key(config.seed), state.step)
     params, moments = split_variables(state.variables)
     replicated, shared = PartitionSpec(), PartitionSpec("batch")
-    gradient, new_moments, loss, demands = jax.shard_map(
+    gradient, new_moments, loss, asked, demands = jax.shard_map(
         partial(_share_gradient, config, limits),
         mesh=batch_mesh(config.batch_size),
         in_specs=(replicated, replicated, replicated, shared),
@@ -174,7 +107,7 @@ def train_step(
     )
     step = state.step + fitting
     skipped = state.skipped + (fitting & ~finite)
-    report = StepReport(loss, norm, fitting, demands)
+    report = StepReport(loss, norm, fitting, asked, demands)
     return TrainState(variables, optimizer, step, skipped), report
 
 

@@ -43,7 +43,13 @@ def unfilled(network, attributes, query_attributes):
             key, jnp.zeros((rows, attributes)), None, geometry
         )
         shader = Shader(network, True).init(
-            key, codes, jnp.zeros((rows, query_attributes)), None, level.mask, field
+            key,
+            codes,
+            jnp.zeros((rows, query_attributes)),
+            None,
+            level.mask,
+            field,
+            level.mask,
         )
         return encoder, shader
 

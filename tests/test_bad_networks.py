@@ -11,6 +11,7 @@ from refusals import INF, KEY, NAN, POINTS, UP, WORDS, Table, assert_refused, ea
 
 from ginn_jax import image, inference, metrics, presets
 from ginn_jax.searches import uniform_limits
+from ginn_jax.shading import Encoded
 
 PICTURE = np.ones((12, 12))
 FRAME = {"position": POINTS.reshape(4, 5, 3), "normal": UP.reshape(4, 5, 3)}
@@ -44,7 +45,22 @@ def conv(**change):
     return replace(tiny.NETWORK.query, **change)
 
 
+def lit(**change):
+    """Two channels of light and codes of two."""
+    given = {"network": LIT, "material": None, "light": np.ones((2, 20, 1))}
+    return encode(**given | change)
+
+
+def lit_frame(**change):
+    """A frame that f_2D sees the light of; its codes have two channels."""
+    network = replace(LIT, asks="all")
+    codes = Encoded(None, None, None, None, np.ones(2, np.float32))
+    given = FRAME | {"mask": np.ones((4, 5), bool)} | change
+    return image.shade_image(network, tiny.LIMITS, {}, codes, **given)
+
+
 LIT = replace(tiny.NETWORK, lights=1)
+MADE = replace(LIT, materials=1)
 OTHER = uniform_limits(presets.RELEASED, 64)
 
 TABLE: Table = {
@@ -64,6 +80,16 @@ TABLE: Table = {
             "light is .3, 5, 1., the network takes",
         ),
         ({"network": LIT, "light": np.full((3, 20, 1), NAN)}, "light holds non-finite"),
+        (
+            {"network": LIT, "light": np.full((3, 20, 1), 1e39)},
+            "light holds non-finite",
+        ),
+        (
+            {"network": LIT, "light": -np.ones((3, 20, 1))},
+            "light holds numbers below 0",
+        ),
+        ({"network": LIT, "light": np.ones((0, 20, 1))}, "light is .0, 20, 1., the"),
+        ({"position": POINTS.astype(float) * 1e39}, "the cloud holds non-finite"),
         ({"limits": OTHER}, "the limits lack .*: they are of another network"),
     ],
     shade: [
@@ -72,6 +98,20 @@ TABLE: Table = {
         ({"position": POINTS * NAN}, "points holds non-finite"),
         ({"normal": UP * 3}, "normals are .* not of unit length"),
         ({"network": replace(LIT, asks="all")}, "light is .*, the network takes"),
+    ],
+    lit: [
+        (
+            {"network": MADE, "material": np.ones((3, 20, 1))},
+            r"light, material and codes have \[2, 3\] channels: give all the same",
+        ),
+    ],
+    lit_frame: [
+        (
+            {"light": np.ones((2, 5, 4, 1))},
+            r"light \(2, 5, 4, 1\) does not fit the mask \(4, 5\): give",
+        ),
+        ({"light": np.ones((2, 20))}, r"light \(2, 20\) does not fit the mask"),
+        ({"light": np.ones((3, 4, 5, 1))}, r"codes have \[2, 3\] channels"),
     ],
     frame: [
         ({"mask": np.ones((4, 5), int)}, r"mask is int64 \(4, 5\): give bool"),
@@ -103,7 +143,31 @@ TABLE: Table = {
     network: [
         ({"encoder": (conv(skip="gone", target=0),)}, "skip of query is 'gone': give"),
         ({"encoder": (conv(target=7),)}, "target of query 7 must be from 0 to 1"),
-        ({"query": conv(source=-2)}, "source of query -2 must be from 0 to 1"),
+        (
+            {"query": conv(source=-2)},
+            "query begins on level -2, where the table has come",
+        ),
+        ({"encoder": tiny.NETWORK.encoder[1:]}, "skip of up_1 is .conv_0.: give"),
+        (
+            {"encoder": tiny.NETWORK.encoder[1:2] * 2},
+            "pool_1 begins on level 0, where the table has come to 1",
+        ),
+        ({"encoder": tiny.NETWORK.encoder[:1] * 2}, "two convolutions are called"),
+        (
+            {"encoder": tiny.NETWORK.encoder[:2], "query": conv(source=1)},
+            "no convolution within level 1",
+        ),
+        (
+            {"encoder": tiny.NETWORK.encoder[:3], "query": conv(source=1)},
+            "let the encoder end there",
+        ),
+        ({"query": conv(target=0)}, "target of query 0 must be from -1 to -1"),
+        ({"linear": True}, "networks that are linear .* take light"),
+        ({"materials": 1}, "networks that .* take materials take light"),
+        (
+            {"lights": 1, "beams": 2, "query": conv(mixes=True)},
+            "query mixes, but light passes it by itself",
+        ),
     ],
     conv: [
         ({"bandwidth": 0.0}, "bandwidth of query 0.0 must be positive"),

@@ -21,7 +21,16 @@ from damaged import contents, refused
 from saved import STATE, restore, save_state
 
 from experiments import ao_train, gi_train
-from ginn_jax import checkpoint, commandline, dataset, fit, lighting, mesh, samples
+from ginn_jax import (
+    checkpoint,
+    commandline,
+    dataset,
+    fit,
+    lighting,
+    mesh,
+    run_record,
+    samples,
+)
 from ginn_jax.errors import InputError
 
 NOBODY = 65534
@@ -59,7 +68,7 @@ def save_cloud(folder):
 
 
 def save_record(folder):
-    checkpoint.save_run(folder, tiny.CONFIG, tiny.ROOM, {})
+    run_record.save_run(folder, tiny.CONFIG, tiny.ROOM, {})
 
 
 def save_losses(folder):

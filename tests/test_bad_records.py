@@ -13,7 +13,7 @@ import tiny
 from damaged import Row, assert_refused, directory, each_row, missing, zeros
 from saved import STATE, restore, save_state
 
-from ginn_jax import checkpoint, dataset, lit_clouds
+from ginn_jax import checkpoint, dataset, lit_clouds, run_record
 
 LIT, GREY = lit_clouds.load_lit_cloud, dataset.load_cloud
 
@@ -43,7 +43,7 @@ def run(record=None, text=None, damage=None):
     """The folder of a run with this record and a checkpoint."""
 
     def make(folder):
-        checkpoint.save_run(folder, tiny.CONFIG, tiny.ROOM, {})
+        run_record.save_run(folder, tiny.CONFIG, tiny.ROOM, {})
         saved = json.loads((folder / "run.json").read_text()) | (record or {})
         content = json.dumps(saved) if text is None else text
         (folder / "run.json").write_text(content)
@@ -67,7 +67,7 @@ def halve_checkpoint(folder):
 
 
 def resume(folder):
-    return checkpoint.load_run(folder, tiny.CONFIG, {})
+    return run_record.load_run(folder, tiny.CONFIG, {})
 
 
 def with_training(**change):
@@ -85,7 +85,7 @@ def with_training(**change):
 
 ROWS = [
     # Clouds on disk
-    Row("no shard", missing("a.npz"), GREY, "no such cloud"),
+    Row("no shard", missing("a.npz"), GREY, "no such file"),
     Row("half a shard", shard(lambda b: b[: len(b) // 2]), GREY, "damaged: delete it"),
     Row("1 GB shard of nothing", zeros("a.npz"), GREY, "damaged: delete it"),
     Row("shard with a pickle", pickled, GREY, "damaged: delete it"),

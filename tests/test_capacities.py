@@ -18,7 +18,7 @@ from hypothesis import Phase, given, settings
 from oracles import neighbors
 from strategies import ALL_PAIRS, POINTS, SEEDS, padded
 
-from ginn_jax import hierarchy, inference, packets, train
+from ginn_jax import hierarchy, inference, packets, recipe, train
 from ginn_jax.limits import Limits
 from ginn_jax.receptive_field import kde_weight
 from ginn_jax.voxels import build_grid
@@ -162,7 +162,7 @@ def counted(monkeypatch, name):
 def test_host_calls_find_room_and_drop_nothing(monkeypatch, caplog):
     """Every capacity lacks one: the result is that with room, at the second attempt."""
     network, roomy = tiny.ONE_LEVEL, tiny.ONE_LEVEL_LIMITS
-    config = train.Training(network, 1, batch_size=1, points=64, queries=32)
+    config = recipe.Training(network, 1, batch_size=1, points=64, queries=32)
     variables = train.init_state(config).variables
     cloud = tiny.sphere_on_plane(300, 0)
     ends = cloud.position, cloud.normal
@@ -204,7 +204,7 @@ def test_one_stage_without_room_does_not_swell_the_others(monkeypatch):
     """A Poisson disk that misses edges keeps points in crowds, with edges in crowds."""
     calls = counted(monkeypatch, "encode_whole")
     network, roomy = tiny.ONE_LEVEL, dict(tiny.ONE_LEVEL_LIMITS.sizes)
-    config = train.Training(network, 1, batch_size=1, points=64, queries=32)
+    config = recipe.Training(network, 1, batch_size=1, points=64, queries=32)
     variables = train.init_state(config).variables
     cloud = tiny.sphere_on_plane(2000, 0)
     ends = cloud.position, cloud.normal

@@ -1,5 +1,6 @@
 import json
 import shutil
+import time
 from dataclasses import replace
 
 import jax
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 import tiny
 
-from ginn_jax import checkpoint
+from ginn_jax import checkpoint, run_record
 from ginn_jax.errors import InputError
 from ginn_jax.limits import Limits
 from ginn_jax.room import Room
@@ -83,6 +84,18 @@ def test_newest_two_are_kept_and_the_newest_restored(third, tmp_path):
     assert restore(tmp_path).step == 7
 
 
+def test_reading_a_run_leaves_what_is_being_written(third, recorded):
+    """Whoever writes is not done: what looks left over may be half of a checkpoint."""
+    save(recorded, third)
+    half = recorded / "checkpoints" / "9.orbax-checkpoint-tmp"
+    half.mkdir()
+    (half / "part").write_text("half")
+    _, _, variables = checkpoint.load_weights(recorded)
+    assert tiny.identical(jax.tree.map(np.array, variables), third.variables)
+    time.sleep(0.5)  # orbax cleans up beside whatever else it does
+    assert (half / "part").read_text() == "half"
+
+
 def restore_or_reason(folder):
     """What is restored and None, or None and why not."""
     try:
@@ -122,12 +135,12 @@ def test_checkpoint_of_another_network_is_refused(third, tmp_path):
 @pytest.fixture
 def recorded(tmp_path):
     """A folder with the record of a run."""
-    checkpoint.save_run(tmp_path, CONFIG, ROOM, EXTRA, SECONDS)
+    run_record.save_run(tmp_path, CONFIG, ROOM, EXTRA, SECONDS)
     return tmp_path
 
 
 def test_record_comes_back(recorded):
-    room, seconds = checkpoint.load_run(recorded, CONFIG, EXTRA)
+    room, seconds = run_record.load_run(recorded, CONFIG, EXTRA)
     assert dict(room.usual.sizes) == dict(ROOM.usual.sizes)
     assert dict(room.most.sizes) == dict(LIMITS.sizes)
     assert seconds == SECONDS
@@ -150,19 +163,19 @@ def test_record_comes_back(recorded):
 def test_other_configuration_is_refused(recorded, change):
     [name] = change
     with pytest.raises(InputError, match=rf"^[^\n]*run\.json[^\n]* {name}\b[^\n]*$"):
-        checkpoint.load_run(recorded, replace(CONFIG, **change), EXTRA)
+        run_record.load_run(recorded, replace(CONFIG, **change), EXTRA)
 
 
 @pytest.mark.parametrize("extra", [{"clouds": 13, "rays": 64}, EXTRA | {"new": 1}])
 def test_other_data_is_refused(recorded, extra):
     name = "clouds" if "new" not in extra else "new"
     with pytest.raises(InputError, match=rf"another {name}\b"):
-        checkpoint.load_run(recorded, CONFIG, extra)
+        run_record.load_run(recorded, CONFIG, extra)
 
 
 def test_no_record_is_refused(tmp_path):
     with pytest.raises(InputError, match="no run to resume"):
-        checkpoint.load_run(tmp_path, CONFIG, EXTRA)
+        run_record.load_run(tmp_path, CONFIG, EXTRA)
 
 
 @pytest.mark.parametrize(
@@ -182,19 +195,19 @@ def test_damaged_record_is_refused(recorded, damage):
     path = recorded / "run.json"
     path.write_text(damage(path.read_text()))
     with pytest.raises(InputError, match=r"^[^\n]*run\.json[^\n]*$"):
-        checkpoint.load_run(recorded, CONFIG, EXTRA)
+        run_record.load_run(recorded, CONFIG, EXTRA)
 
 
 def test_undecodable_record_is_refused(recorded):
     (recorded / "run.json").write_bytes(b"\xff\xfe\x00{")
     with pytest.raises(InputError, match=r"run\.json is damaged"):
-        checkpoint.load_run(recorded, CONFIG, EXTRA)
+        run_record.load_run(recorded, CONFIG, EXTRA)
 
 
 def test_weights_of_a_run_come_back(third, saved, tmp_path):
     """With nothing but the folder: the configuration is read as well."""
     shutil.copytree(saved, tmp_path, dirs_exist_ok=True)
-    checkpoint.save_run(tmp_path, CONFIG, ROOM, EXTRA)
+    run_record.save_run(tmp_path, CONFIG, ROOM, EXTRA)
     config, limits, variables = checkpoint.load_weights(tmp_path)
     assert config == CONFIG
     assert hash(config) == hash(CONFIG)
@@ -237,4 +250,4 @@ def test_a_run_of_before_two_sizes_of_room_is_of_another_version(recorded):
     del record["usual"]
     path.write_text(json.dumps(record))
     with pytest.raises(InputError, match=r"^[^\n]*another version[^\n]*$"):
-        checkpoint.load_run(recorded, CONFIG, EXTRA)
+        run_record.load_run(recorded, CONFIG, EXTRA)

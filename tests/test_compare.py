@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments import evaluate as experiment
-from ginn_jax import blocks, checkpoint, report, scenes
+from ginn_jax import blocks, checkpoint, report, run_record, scenes
 from ginn_jax.compare_networks import OURS, redrawn
 from ginn_jax.compare_report import (
     RIVALS,
@@ -105,7 +105,7 @@ def finished_run(folder, network=tiny.ONE_LEVEL):
     """A folder as a training run leaves it, of the tiny untrained network."""
     folder.mkdir()
     config = replace(tiny.CONFIG, network=network)
-    checkpoint.save_run(folder, config, tiny.ONE_LEVEL_ROOM, LEARNED)
+    run_record.save_run(folder, config, tiny.ONE_LEVEL_ROOM, LEARNED)
     manager = checkpoint.open_manager(folder, fresh=True)
     checkpoint.save_state(manager, tiny.fresh_state(config, tiny.ONE_LEVEL_LIMITS))
     manager.close()

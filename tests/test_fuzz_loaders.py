@@ -15,7 +15,15 @@ from hypothesis import strategies as st
 from saved import restore, save_state
 from test_bad_files import ONE_POINT
 
-from ginn_jax import checkpoint, dataset, lighting, lit_clouds, mesh, samples
+from ginn_jax import (
+    checkpoint,
+    dataset,
+    lighting,
+    lit_clouds,
+    mesh,
+    run_record,
+    samples,
+)
 from ginn_jax.errors import InputError, InputWarning
 from ginn_jax.renderer import use_mitsuba
 
@@ -39,7 +47,7 @@ def written(name):
         elif name.startswith("lit"):
             lit_clouds.save_lit_cloud(path, lit_cloud(), {"seed": 1})
         elif name == "run.json":
-            checkpoint.save_run(path.parent, tiny.CONFIG, tiny.ROOM, {"seed": 1})
+            run_record.save_run(path.parent, tiny.CONFIG, tiny.ROOM, {"seed": 1})
         elif kind in ("hdr", "exr", "pfm"):
             pixels = np.random.default_rng(0).uniform(size=(4, 8, 3))
             use_mitsuba()[0].Bitmap(pixels.astype(np.float32)).write(str(path))
@@ -153,7 +161,7 @@ def test_any_archive_is_a_cloud_or_refused(name, call, data):
 @given(st.data())
 def test_any_record_is_a_run_or_refused(how, data):
     def resume(folder):
-        return checkpoint.load_run(folder, tiny.CONFIG, {"seed": 1})
+        return run_record.load_run(folder, tiny.CONFIG, {"seed": 1})
 
     call = resume if how == "resume" else checkpoint.load_weights
     found = load(call, "run.json", data.draw(spoiled(written("run.json"))))

@@ -50,6 +50,11 @@ def test_limits_that_are_too_small_are_named(shallow, names):
     assert lm.exceeded(limits, demands) == {name: shallow[name] for name in names}
 
 
+def test_no_capacity_is_nothing():
+    """Arrays of no rows cannot be gathered from, though nothing be needed."""
+    assert lm.round_up(0) == lm.round_up(1) > 0
+
+
 @pytest.mark.parametrize("start", [100, 1 << 19])
 @pytest.mark.parametrize(
     "sizes", [(700, 1000), (1000, 700), (5, 4000), (700,) * 10 + (2000,)]

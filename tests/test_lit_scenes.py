@@ -246,7 +246,7 @@ def test_every_setting_and_light_is_in_the_origin(sources):
 
 def test_worker_makes_the_same_clouds(sources, tmp_path):
     folder, settings = tmp_path / "clouds", EFFECTS[0]
-    with pytest.raises(InputError, match="no such cloud"):
+    with pytest.raises(InputError, match="no such file"):
         read_clouds(sources[:2], settings, folder)
     done = list(scenes.make_clouds(sources[:2], settings, folder, 1))
     assert sorted(done) == sorted(folder.iterdir())

@@ -161,11 +161,13 @@ def test_gradient_reaches_every_parameter_of_the_papers_layers():
         assert not np.array_equal(old, new)
 
 
-def test_padding_changes_nothing_in_training():
+@pytest.mark.parametrize("splat", [False, True])
+def test_padding_changes_nothing_in_training(splat):
     """Neither loss nor gradient nor running moments, whatever the padding holds."""
-    small = gradient_of(SMALL_PAPER)(example_of(SMALL_PAPER, 1)(cloud(), queries()))
-    large = gradient_of(SMALL_PAPER)(
-        example_of(SMALL_PAPER, 1.5)(cloud(rubbish=-0.7), queries())
+    network = replace(SMALL_PAPER, splat=splat)
+    small = gradient_of(network)(example_of(network, 1)(cloud(), queries()))
+    large = gradient_of(network)(
+        example_of(network, 1.5)(cloud(rubbish=-0.7), queries())
     )
     for a, b in zip(jax.tree.leaves(small), jax.tree.leaves(large), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5 * max(1, np.abs(a).max()))

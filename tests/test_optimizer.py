@@ -9,7 +9,8 @@ import optax
 import pytest
 import tiny
 
-from ginn_jax import train
+from ginn_jax import recipe
+from ginn_jax.kernels import init_kernel
 
 
 def rates(config, steps):
@@ -17,7 +18,7 @@ def rates(config, steps):
 
     Adam's is then 1, and Muon's as near to .2 as Newton and Schulz come to orthogonal.
     """
-    optimizer = train.make_optimizer(config)
+    optimizer = recipe.make_optimizer(config)
     update = jax.jit(optimizer.update)
     gradient, found = jnp.eye(4, dtype=jnp.float32), []
     state = optimizer.init(gradient)
@@ -53,9 +54,32 @@ def test_warm_up_fits_into_a_short_run():
     assert found[10] < 1e-6
 
 
+def test_biases_of_kernel_blocks_are_no_matrix():
+    """Twice the gradient is the same step of Adam, whatever the other blocks' are."""
+    optimizer = recipe.make_optimizer(replace(tiny.CONFIG, clip_norm=1e9))
+    kernel = init_kernel(3, 8, 4, 4, key=jax.random.key(0))
+    rng = np.random.default_rng(0)
+    gradient = jax.tree.map(lambda w: jnp.float32(rng.normal(size=w.shape)), kernel)
+    other = gradient._replace(b2=gradient.b2.at[0].multiply(0.0))
+
+    def second(gradient):
+        state = optimizer.init(kernel)
+        with jax.numpy_dtype_promotion("standard"):
+            for _ in range(2):  # the warm-up begins at a rate of 0
+                change, state = optimizer.update(gradient, state, kernel)
+        return change
+
+    one, two = second(gradient), second(other)
+    assert np.abs(one.b2[1]).min() > 0
+    np.testing.assert_allclose(one.b2[1], two.b2[1], rtol=1e-5)
+    block = np.asarray(one.w2[0], np.float64)
+    spread = np.linalg.svd(block, compute_uv=False)
+    assert spread.max() < 3 * spread.min()
+
+
 @pytest.mark.parametrize("schedule", ["cosine", "paper"])
 def test_gradient_is_clipped(schedule):
-    optimizer = train.make_optimizer(replace(tiny.CONFIG, schedule=schedule))
+    optimizer = recipe.make_optimizer(replace(tiny.CONFIG, schedule=schedule))
     gradient = {"a": jnp.float32(300), "b": jnp.float32(-400)}
     with jax.numpy_dtype_promotion("standard"):
         _, state = optimizer.update(gradient, optimizer.init(gradient), gradient)

@@ -10,7 +10,7 @@ import pytest
 import tiny
 
 from experiments.export import effect_of, fixed_scene_error
-from ginn_jax import checkpoint, fit, pretrained, report
+from ginn_jax import checkpoint, fit, pretrained, report, run_record
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model
 
@@ -30,7 +30,7 @@ def exported(tmp_path_factory):
     run, folder = (tmp_path_factory.mktemp(n) for n in ("run", "weights"))
     state = tiny.fresh_state()
     record = {"objects": [], "data": {}, "start": "runs/first"}
-    checkpoint.save_run(run, tiny.CONFIG, tiny.ROOM, record)
+    run_record.save_run(run, tiny.CONFIG, tiny.ROOM, record)
     manager = checkpoint.open_manager(run, fresh=True)
     checkpoint.save_state(manager, state)
     manager.close()

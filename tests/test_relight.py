@@ -8,6 +8,7 @@ import pytest
 import tiny
 
 from ginn_jax import blocks, inference, train
+from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import LitCloud, network_numbers
 from ginn_jax.presets import only_2d, only_3d
 from ginn_jax.relight import prepare_relighting, relight
@@ -142,6 +143,59 @@ def test_relighting_is_shading(case):
         ]
         expected = np.maximum(shade(network, variables, *lights), 0)
         close(relight(network, variables, ready, *lights), expected)
+
+
+def test_queries_out_of_reach_have_values_in_either_way(case):
+    """Nothing is found near them: the capacities measured are of nothing."""
+    network, variables, cloud, queries = case
+    far = queries._replace(position=queries.position + np.float32([9, 0, 0]))
+    ready, limits = prepare_relighting(
+        network, limits_of(network), variables, cloud, far, key=KEY
+    )
+    values = relight(network, variables, ready, cloud, far)
+    assert np.isfinite(values).all()
+    again, _ = prepare_relighting(network, limits, variables, cloud, far, key=KEY)
+    close(relight(network, variables, again, cloud, far), values)
+
+
+@pytest.fixture(scope="module")
+def prepared():
+    network = EFFECTS["homogeneous"]
+    config = replace(tiny.CONFIG, network=network)
+    variables = jax.device_get(train.init_state(config).variables)
+    given = network, limits_of(network), variables, lit(400, 1)
+    return given, prepare_relighting(*given, lit(0, 2), key=KEY)[0]
+
+
+def test_no_queries_have_no_values(prepared):
+    (network, _, variables, cloud), ready = prepared
+    assert relight(network, variables, ready, cloud, lit(0, 2)).shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("cloud", "queries", "message"),
+    [
+        (lit(399, 1), lit(0, 2), "the cloud has 399 points, 400 were prepared"),
+        (lit(400, 1), lit(5, 2), "queries has 5 points, 0 were prepared"),
+        (scaled(lit(400, 1), np.nan), lit(0, 2), "light holds non-finite"),
+    ],
+)
+def test_what_was_not_prepared_is_refused(prepared, cloud, queries, message):
+    (network, _, variables, _), ready = prepared
+    with pytest.raises(InputError, match=message):
+        relight(network, variables, ready, cloud, queries)
+
+
+@pytest.mark.parametrize(
+    ("network", "cloud", "message"),
+    [
+        (tiny.ONE_LEVEL, lit(400, 1), "the network takes no light"),
+        (EFFECTS["homogeneous"], lit(0, 1), "the cloud is empty"),
+    ],
+)
+def test_what_cannot_be_lit_is_not_prepared(network, cloud, message):
+    with pytest.raises(InputError, match=message):
+        prepare_relighting(network, limits_of(network), {}, cloud, lit(5, 2), key=KEY)
 
 
 def test_beams_are_linear_once_features_are_blind_to_light():

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import tiny
 
-from ginn_jax import checkpoint, dataset, fit, room
+from ginn_jax import checkpoint, dataset, fit, room, run_record
 from ginn_jax.errors import InputError
 from ginn_jax.train import state_shapes
 
@@ -145,7 +145,7 @@ def main(folder, place, moment):
         if place == "step":
             killer()
 
-    resume = (folder / checkpoint.RECORD).exists()
+    resume = (folder / run_record.RECORD).exists()
     told("begun")
     train(folder, [cloud(seed) for seed in range(3)], resume, told)
 
@@ -224,7 +224,7 @@ def test_killed_run_ends_as_an_unbroken_one(unbroken):
 def test_time_spent_before_counts(unbroken):
     folder = unbroken.parent / "earlier"
     shutil.copytree(unbroken, folder)
-    path = folder / checkpoint.RECORD
+    path = folder / run_record.RECORD
     record = json.loads(path.read_text())
     assert record["seconds"]["train"] > 0
     path.write_text(json.dumps(record | {"seconds": {"compile": 1e6, "train": 2e6}}))
@@ -244,6 +244,25 @@ def test_part_of_a_checkpoint_is_ignored_or_named(unbroken):
         file.unlink()
     with pytest.raises(InputError, match=rf"^checkpoint {newest} [^\n]*\Z"):
         checkpoint.load_weights(folder)
+
+
+@pytest.mark.parametrize(
+    ("radius", "sizes", "message"),
+    [
+        (
+            1e-4,
+            (1200, 1200),
+            "step 0 has no points left to ask for: all are in level 0",
+        ),
+        (0.08, (1200, 1300), "clouds have from 1200 to 1300 points: cut them"),
+    ],
+)
+def test_training_on_nothing_is_refused(tmp_path, radius, sizes, message):
+    network = replace(tiny.ONE_LEVEL, levels=(radius,))
+    clouds = [tiny.sphere_on_plane(n, i) for i, n in enumerate(sizes)]
+    config = replace(tiny.CONFIG, network=network, steps=3)
+    with pytest.raises(InputError, match=message):
+        fit.fit(config, clouds, tmp_path, fit.Schedule(), lambda *_: None)
 
 
 def test_progress_leaves_skipped_steps_out():

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jax._src import compiler
 
-from ginn_jax import train
+from ginn_jax import recipe, train
 from ginn_jax.dataset import ShadedPoints, stack_clouds
 from ginn_jax.limits import Limits
 from ginn_jax.presets import compact_network
@@ -20,7 +20,7 @@ from ginn_jax.room import Room
 from ginn_jax.searches import limit_names, uniform_limits
 
 NETWORK = compact_network(k=4, levels=(0.08, 0.2), query_radius=0.16, latent=4)
-CONFIG = train.Training(
+CONFIG = recipe.Training(
     NETWORK,
     steps=200,
     batch_size=2,
