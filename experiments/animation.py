@@ -84,7 +84,7 @@ class Options:
 
 
 ANEW = f"{OURS}, frame by frame"
-QUICK = {"frames": 2, "resolution": 48, "reference": 8, "points": 3000, "looks": 32}
+QUICK = {"frames": 3, "resolution": 48, "reference": 8, "points": 3000, "looks": 32}
 QUICK |= {"draws": 2, "disks": ()}
 
 
@@ -120,6 +120,7 @@ def main(options: Options) -> dict[str, Any]:
     metrics = {
         "flicker": pooled(list(found.values())),
         "sequences": found,
+        "frames": {name: len(meshes) for name, meshes in scenes.items()},
         "options": {k: str(v) for k, v in asdict(options).items()},
         "environment": report.environment(),
     }

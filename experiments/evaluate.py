@@ -118,20 +118,24 @@ def main(options: Options) -> dict[str, Any]:
     clouds = make(console, "clouds", sources, settings, options.out / "clouds")
     at_points, networks = errors_at_points(networks, clouds, sources, settings)
     networks |= disk_variants(networks[OURS], options.disks)
-    rows, front_rows, shown = [], [], []
+    rows, front_rows, shown, light = [], [], [], []
     for source, cloud in zip(sources, clouds, strict=True):
         console.print(f"{source.name}")
         found = compare_scene(options, settings, source, cloud, networks)
         rows += found[0]
         front_rows += found[1]
         shown.append((source.name, found[2]))
-        networks = found[3]
+        light.append(found[3])
+        networks = found[4]
     memory = {
         name: network_memory(networks[name], count_given(settings.points))
         for name in NETWORKS
     }
     at_points = {n: r | {"memory_mib": memory[n]} for n, r in at_points.items()}
     metrics = summary(options, at_points, rows, front_rows, [s.name for s in sources])
+    metrics["seconds_of_light"] = {
+        place: float(np.mean([row[place] for row in light])) for place in light[0]
+    }
     compare_report.draw_methods(options.out / "ablation.png", shown[:4])
     compare_report.draw_front(
         options.out / "error_against_time.png", metrics["error_against_time"]
@@ -151,14 +155,15 @@ def compare_scene(
     source: Source,
     cloud: Any,
     networks: dict[str, Trained],
-) -> tuple[list[Row], list[Row], dict[str, np.ndarray], dict[str, Trained]]:
+) -> tuple[list[Row], list[Row], dict[str, np.ndarray], Row, dict[str, Trained]]:
     """All methods on all views of a scene.
 
-    Rows of the table, rows of error against run time, pictures of the first view.
+    Rows of the table, rows of error against run time, pictures of the first view, and
+    what its direct light took.
     """
     stage = compare.set_stage(source, settings)
     given, units = points_given(cloud)
-    rows, front, shown = [], [], {}
+    rows, front, shown, light = [], [], {}, {}
     for view in range(options.views):
         azimuth = 35.0 + 360.0 * view / options.views
         size = options.resolution
@@ -178,12 +183,14 @@ def compare_scene(
         rows += [p.row | {"name": source.name, "view": view} for p in pictures]
         if view == 0:
             shown = compare.displayed(shot, pictures)
+            ends = stage, given, shot, settings
+            light = compare.seconds_of_light(*ends, seed=source.seed)
             front += [p.row for p in pictures]
             own = next(p for p in pictures if p.row["method"] == OURS)
             front += rivals(options, settings, shot, given, own, networks, units)
             rates = {OURS + at_scale(scale) for scale in (1.0, *options.scales)}
             front += [codes_kept(row) for row in front if row["method"] in rates]
-    return rows, front, shown, networks
+    return rows, front, shown, light, networks
 
 
 def rivals(

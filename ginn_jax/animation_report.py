@@ -79,8 +79,9 @@ def write_report(m: dict[str, Any]) -> str:
     several = len(found) > 1
     return f"""# Animation, {options["effect"]}
 
-{", ".join(found)}: {options["frames"]} frames at {options["resolution"]} x
-{options["resolution"]}, reference of {options["reference"]} rays or paths a pixel.
+{", ".join(f"{name} ({m['frames'][name]} frames)" for name in found)} at
+{options["resolution"]} x {options["resolution"]}, reference of {options["reference"]}
+rays or paths a pixel.
 {env["processor"]}, {env["cores"]} cores.
 
 Flicker is the mean squared change from frame to frame that the reference does not have,

@@ -21,7 +21,8 @@ from ginn_jax.dataset import (
 
 LARGEST_HALF = 65504.0
 LIGHTS = ("irradiance", "target", "variance")
-# Extinctions, in units per length of the object, go in by log(1 + e) / log(1 + this).
+# Mean free paths in the length of an object beyond which nothing is seen to change: no
+# medium is denser. Extinctions e go in by log(1 + e) / log(1 + this).
 DENSE = 500.0
 
 

@@ -37,6 +37,7 @@ from ginn_jax.objects import (
     Source,
     file_lights,
     file_sources,
+    mixed,
     pair_up,
     point_lights,
     procedural_lights,
@@ -56,7 +57,8 @@ class LitOptions(RunOptions):
     """What every effect that carries light can be told."""
 
     envmaps: Path | None = None
-    """An environment map or a folder of them to train on as well."""
+    """An environment map or a folder of them to train under as well, each once or
+    more where there are as many objects."""
     lights: int = 1
     """Lights for every object."""
     test_envmaps: Path | None = None
@@ -88,7 +90,8 @@ def run_experiment(
     console, clock, begin = Console(), Clock(), time.perf_counter()
     seen, unseen = choose_sources(options)
     if options.split == "paper":
-        settings = replace(settings, points=PAPER_SPLIT.points, paths=PAPER_SPLIT.paths)
+        sizes = {"points": PAPER_SPLIT.points, "paths": PAPER_SPLIT.paths}
+        options, settings = replace(options, **sizes), replace(settings, **sizes)
     folder = options.out / "data"
     clouds = make(console, "training clouds", seen, settings, folder / "training")
     exact = with_exact_targets(settings, options.quick)
@@ -131,10 +134,10 @@ def choose_sources(
     objects = procedural_sources(options.shapes, seed * SEEDS_APART)
     objects += _files(options.meshes, find_meshes, file_sources)
     lights = procedural_lights(max(options.shapes, 30), seed * SEEDS_APART)
-    lights += _files(options.envmaps, find_environments, file_lights)
+    maps = _files(options.envmaps, find_environments, file_lights)
     if options.split == "paper":
-        return paper_sources(options, objects, lights)
-    lights = split_apart(lights, [len(lights)], seed)[0]
+        return paper_sources(options, objects, lights + maps)
+    lights = mixed(lights, maps, len(objects) * each, seed)
     unseen = procedural_sources(options.test_shapes, UNSEEN_SEED + seed)
     skies: list[LightSource] = _files(
         options.test_envmaps, find_environments, file_lights

@@ -21,7 +21,7 @@ from ginn_jax.irradiance import (
     light_scene,
 )
 from ginn_jax.lighting import Light
-from ginn_jax.lit_clouds import LitCloud
+from ginn_jax.lit_clouds import DENSE, LitCloud
 from ginn_jax.mesh import Mesh
 from ginn_jax.objects import Source, load_light, load_object
 from ginn_jax.reference import Scene, ambient_occlusion, build_scene
@@ -31,8 +31,6 @@ from ginn_jax.subsurface import Medium, subsurface_exitance
 
 FAR, PROBE_RAYS = 100.0, 32
 OBJECT = 0  # the material of what stands on the ground
-# Mean free paths in the length of an object beyond which nothing is seen to change.
-DENSEST = 500.0
 # The share of lost walks from which on a mesh is said not to hold its medium.
 MOST_LOST = 0.05
 
@@ -118,14 +116,14 @@ def draw_medium(
     """Extinction per length of the object, and index of refraction.
 
     The extinction is that at which the mean of the colours absorbs as much as was
-    drawn: absorption / (1 - single-scattering albedo), at most `DENSEST`.
+    drawn: absorption / (1 - single-scattering albedo), at most `DENSE`.
     """
     rng = np.random.default_rng((seed, 5))
     absorption = np.clip(rng.exponential(), 0.1, 5.0) * settings.absorption
     ior = rng.uniform(1.0, 1.5)
     alpha = single_scattering_albedo(albedo, ior)
     extinction = absorption * settings.size / np.mean(1 - alpha)
-    return np.array([min(extinction, DENSEST), ior])
+    return np.array([min(extinction, DENSE), ior])
 
 
 def transport(

@@ -1,5 +1,6 @@
 """Where objects and lights come from: seeds and files, and which belong together."""
 
+import json
 import warnings
 import zlib
 from collections.abc import Sequence
@@ -7,6 +8,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -100,7 +102,10 @@ def file_sources(paths: Sequence[Path]) -> list[Source]:
 
 
 def tell_apart(paths: Sequence[Path]) -> list[str]:
-    """The shortest ends of the paths, of one length, that are all different."""
+    """The shortest ends of the paths, of one length, that are all different.
+
+    Paths of which some differ by their endings alone are numbered, all of them.
+    """
     parts = [p.relative_to(p.anchor).with_suffix("").parts for p in paths]
     for length in range(1, max((len(p) for p in parts), default=1) + 1):
         names = ["_".join(p[-length:]) for p in parts]
@@ -149,6 +154,17 @@ def pair_up(
                 seed = zlib.crc32(name.encode())
             pairs.append(replace(source, name=name, light=light, seed=seed))
     return pairs
+
+
+def mixed(
+    lights: Sequence[LightSource], maps: Sequence[LightSource], pairs: int, seed: int
+) -> list[LightSource]:
+    """Lights for so many pairs, those of files among them at random places."""
+    if not maps:
+        return list(lights)
+    both = [*lights[: max(pairs - len(maps), 0)], *maps]
+    order = np.random.default_rng((seed, 7)).permutation(len(both))
+    return [both[i] for i in order]
 
 
 def load_object(source: Source, ground: bool = True) -> Mesh:
@@ -206,7 +222,21 @@ def origin_of(source: Source) -> dict[str, Any]:
 
 
 def _contents(path: str) -> int:
+    """A checksum of a file and, of a .gltf, of the files that hold its numbers."""
     try:
-        return zlib.crc32(Path(path).read_bytes())
+        found = (given := Path(path)).read_bytes()
+        parts = [given.parent / name for name in _buffers(given, found)]
+        return zlib.crc32(b"".join([found, *(part.read_bytes() for part in parts)]))
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from None
+
+
+def _buffers(path: Path, text: bytes) -> list[str]:
+    """The files that a .gltf names; none where it is damaged: loading will say so."""
+    if path.suffix.lower() != ".gltf":
+        return []
+    try:
+        named = [buffer.get("uri", "data:") for buffer in json.loads(text)["buffers"]]
+        return [unquote(name) for name in named if not name.startswith("data:")]
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return []

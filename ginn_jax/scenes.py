@@ -96,7 +96,11 @@ def make_clouds(
     What `folder` already holds is kept, so a killed run goes on where it was.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    jobs = list({cloud_path(folder, source): source for source in sources}.items())
+    by_path: dict[Path, Source] = {}
+    for source in sources:
+        if by_path.setdefault(cloud_path(folder, source), source) != source:
+            raise InputError(f"two objects are called {source.name}: rename the file")
+    jobs = list(by_path.items())
     workers = min(workers, max(len(jobs), 1))
     size = workers * SCENES_PER_WORKER
     for first in range(0, len(jobs), size):

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ginn_jax.camera import Camera
+from ginn_jax.checks import LARGEST_INDEX, real_array, whole
 from ginn_jax.errors import InputError
 
 # A pixel's depth changes over its width by at most so many widths: at a silhouette its
@@ -73,10 +74,9 @@ def check_images(shape: tuple[int, ...], **images: Any) -> None:
 
 
 def check_counts(**counts: int) -> None:
-    """Raise `InputError` unless every count is at least 1."""
+    """Raise `InputError` unless every count is a whole number from 1 on."""
     for name, count in counts.items():
-        if count < 1:
-            raise InputError(f"{name} {count} must be at least 1")
+        whole(name, count, 1, LARGEST_INDEX)
 
 
 def check_pairs(directions: int) -> None:
@@ -88,8 +88,9 @@ def check_pairs(directions: int) -> None:
 def check_above_zero(**numbers: float) -> None:
     """Raise `InputError` unless every number is above 0 (it may be infinite)."""
     for name, number in numbers.items():
-        if not number > 0:
-            raise InputError(f"{name} {number} must be above 0")
+        array = real_array(name, number)
+        if array.ndim or not array > 0:
+            raise InputError(f"{name} {number} must be a number above 0")
 
 
 def view_axes(camera: Camera) -> Float[np.ndarray, "3 3"]:

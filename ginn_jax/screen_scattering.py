@@ -16,11 +16,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ginn_jax.camera import Camera
+from ginn_jax.checks import number, positive, vector
 from ginn_jax.errors import InputError
 from ginn_jax.screen import (
     STEEPEST,
     Screen,
-    check_above_zero,
     check_counts,
     check_images,
     dot,
@@ -67,11 +67,11 @@ def radiant_exitance(
     2 to 4.
     """
     check_counts(taps=taps)
-    check_above_zero(extinction=extinction, widening=widening)
-    if np.shape(albedo) != (3,):
-        raise InputError(f"albedo {np.shape(albedo)} must be three numbers")
-    if not ior >= 1:
-        raise InputError(f"ior {ior} must be at least 1")
+    positive("extinction", extinction)
+    positive("widening", widening)
+    number("ior", ior, 1.0, 2.0)
+    if not np.all((vector("albedo", albedo) >= 0) & (np.asarray(albedo) <= 1)):
+        raise InputError(f"albedo {albedo} must be from 0 to 1")
     screen = enter_screen(position, normal, mask, camera)
     check_images(screen.mask.shape, irradiance=irradiance)
     albedo = jnp.asarray(albedo, jnp.float32)

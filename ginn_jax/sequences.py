@@ -79,7 +79,8 @@ def load_animation(path: Path) -> Animation:
 def procedural_animation(seed: int, frames: int) -> Animation:
     """A procedural shape that sways: it leans over and back and turns a little."""
     mesh = fit_unit_box(random_shape(seed, closed=True))
-    phase = 2 * np.pi * np.arange(frames)[:, None] / frames
+    # Few frames, too, are to differ from the first on.
+    phase = 2 * np.pi * (np.arange(frames)[:, None] + 0.15) / frames
     x, y, z = mesh.vertices.T.astype(np.float64)
     height = y - y.min()
     turn = 0.5 * np.sin(phase) * height

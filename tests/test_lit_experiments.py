@@ -97,6 +97,29 @@ def test_seen_and_unseen_share_no_object_and_no_light(tmp_path):
     assert any(s.light.path for s in seen)
 
 
+@pytest.mark.parametrize("each", [1, 3])
+def test_every_map_lights_something(tmp_path, each):
+    maps = tmp_path / "maps"
+    maps.mkdir()
+    for i in range(20):
+        (maps / f"map_{i}.hdr").write_bytes(b"seen")
+    options = lit_experiment.LitOptions(shapes=40, envmaps=maps, lights=each)
+    seen, _ = lit_experiment.choose_sources(options)
+    used = [s.light.path for s in seen]
+    assert len({path for path in used if path}) == 20
+    assert None in used
+    again, _ = lit_experiment.choose_sources(options)
+    other, _ = lit_experiment.choose_sources(replace(options, seed=1))
+    assert [s.light.path for s in again] == used
+    assert [s.light.path for s in other] != used
+
+
+def test_without_maps_shapes_keep_their_skies():
+    """What was made of them before is found again."""
+    seen, _ = lit_experiment.choose_sources(lit_experiment.LitOptions(shapes=40))
+    assert [s.name for s in seen] == [f"shape_{i}__sky_{i}" for i in range(40)]
+
+
 def test_the_papers_split_says_what_it_lacks():
     options = lit_experiment.LitOptions(shapes=40, split="paper")
     with pytest.raises(InputError, match="1700"):

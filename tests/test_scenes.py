@@ -126,6 +126,25 @@ def test_changed_mesh_file_is_another_origin(tmp_path):
     assert scenes.cloud_origin(source, SETTINGS) != before
 
 
+def test_changed_numbers_of_a_gltf_are_another_origin(tmp_path):
+    """They lie in a file of their own beside it."""
+    trimesh.creation.box().export(tmp_path / "a b.gltf")
+    source = objects.file_sources([tmp_path / "a b.gltf"])[0]
+    before = objects.origin_of(source)
+    part = next(tmp_path.glob("*.bin"))
+    assert objects.origin_of(source) == before
+    part.write_bytes(part.read_bytes()[::-1])
+    assert objects.origin_of(source) != before
+
+
+def test_two_objects_of_one_name_are_refused(tmp_path):
+    trimesh.creation.box().export(tmp_path / "shape_1.ply")
+    both = objects.procedural_sources(2, 0)
+    both += objects.file_sources([tmp_path / "shape_1.ply"])
+    with pytest.raises(InputError, match="two objects are called shape_1: rename"):
+        list(scenes.make_clouds(both, SETTINGS, tmp_path / "clouds", 1))
+
+
 def test_workers_make_the_same_and_keep_what_is_done(sources, made, tmp_path):
     done = list(scenes.make_clouds(sources, SETTINGS, tmp_path / "new", 2))
     assert sorted(done) == sorted((tmp_path / "new").iterdir())

@@ -118,9 +118,16 @@ def test_the_same_image_gives_the_same_under_jit(method):
 @METHODS
 @pytest.mark.parametrize(
     "options",
-    [{"radius": 0.0}, {"steps": 0}, {"directions": 0}, {"thickness": -1.0}],
+    [
+        {"radius": 0.0},
+        {"radius": "a"},
+        {"steps": 0},
+        {"steps": 2.5},
+        {"directions": 0},
+        {"thickness": -1.0},
+    ],
 )
-def test_bad_arguments_are_refused(method, options):
+def test_bad_arguments_are_refused(method, options, unchecked):
     scene = seen.corner(8)
     with pytest.raises(InputError):
         method(*scene.surface, scene.camera, **({"radius": 0.1} | options))

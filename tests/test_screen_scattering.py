@@ -184,9 +184,21 @@ def test_the_same_image_gives_the_same_under_jit():
 
 
 @pytest.mark.parametrize(
-    "options", [{"extinction": 0.0}, {"ior": 0.5}, {"taps": 0}, {"widening": -1.0}]
+    "options",
+    [
+        {"extinction": 0.0},
+        {"extinction": np.inf},
+        {"ior": 0.5},
+        {"ior": np.nan},
+        {"taps": 0},
+        {"taps": 2.5},
+        {"widening": -1.0},
+        {"albedo": (0.5, 2.0, 0.5)},
+        {"albedo": (0.5, np.nan, 0.5)},
+    ],
 )
-def test_bad_arguments_are_refused(options):
+def test_bad_arguments_are_refused(options, unchecked):
     scene = seen.corner(8)
-    with pytest.raises(InputError):
-        scattered(scene, even(scene), **options)
+    given = {"albedo": ALBEDO, "extinction": 20.0, "ior": 1.3} | options
+    with pytest.raises(InputError, match=next(iter(options))):
+        radiant_exitance(*scene.surface, even(scene), scene.camera, **given)

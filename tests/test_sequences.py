@@ -26,6 +26,12 @@ def test_frames_share_a_unit_box_and_a_ground():
     assert np.abs(np.diff(places, axis=0)).max() > 1e-3
 
 
+@pytest.mark.parametrize("frames", [2, 3])
+def test_a_procedural_animation_of_few_frames_moves(frames):
+    places = sequences.procedural_animation(3, frames).vertices
+    assert np.abs(places[1] - places[0]).max() > 0.02
+
+
 def test_samples_move_with_their_faces():
     meshes = sequences.frames_of(DATA, 5, ground=True)
     carried = sequences.carried_samples(meshes[0], 500, seed=1)

@@ -261,7 +261,8 @@ def test_training_on_nothing_is_refused(tmp_path, radius, sizes, message):
     network = replace(tiny.ONE_LEVEL, levels=(radius,))
     clouds = [tiny.sphere_on_plane(n, i) for i, n in enumerate(sizes)]
     config = replace(tiny.CONFIG, network=network, steps=3)
-    with pytest.raises(InputError, match=message):
+    optax = jax.numpy_dtype_promotion("standard")
+    with optax, pytest.raises(InputError, match=message):
         fit.fit(config, clouds, tmp_path, fit.Schedule(), lambda *_: None)
 
 
