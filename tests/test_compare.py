@@ -54,13 +54,13 @@ def test_lost_cells_are_those_a_rival_wins():
     ours = {"method": OURS, "mse_3d": 0.1, "mse_2d": 0.1, "dssim_2d": 0.1}
     others = [{"method": r, "mse_2d": 0.2, "dssim_2d": 0.2} for r in RIVALS]
     assert lost_cells([ours, *others]) == []
-    others[1] |= {"mse_3d": 0.05}
+    others[RIVALS.index("2D only")] |= {"mse_3d": 0.05}
     others[0] |= {"dssim_2d": 0.09}
     lost = lost_cells([ours, *others])
     assert len(lost) == 2
     assert lost[0].startswith("mse_3d: 2D only 0.05")
     assert lost[1].startswith("dssim_2d: screen space 0.09")
-    fast = {"method": "visibility bitmask", "mse_2d": 0.0, "dssim_2d": 0.0}
+    fast = {"method": "4 paths", "mse_2d": 0.0, "dssim_2d": 0.0}
     assert len(lost_cells([ours, *others, fast])) == 2
 
 
