@@ -23,6 +23,7 @@ from ginn_jax.lit_clouds import LitCloud, mean_light, split_points
 from ginn_jax.neighbors import bucket
 from ginn_jax.objects import Source
 from ginn_jax.pretrained import load_manifest, load_network
+from ginn_jax.process import spare_memory_maps
 from ginn_jax.receptive_field import Oriented
 from ginn_jax.run_record import RECORD, damaged, read_record
 from ginn_jax.scenes import Occlusion, Settings
@@ -140,6 +141,7 @@ def network_picture(
     scale: float = 1.0,
 ) -> tuple[Picture, Trained]:
     """A network's picture, and the network with the limits that it took."""
+    spare_memory_maps()  # every shot and network compiles programs of its own
     network, limits, model = trained
     given = network, limits, model, cloud, shot, scale
     if isinstance(shot, View):
