@@ -12,9 +12,8 @@ from strategies import SEEDS
 
 from ginn_jax import scenes
 from ginn_jax.errors import InputError, InputWarning
-from ginn_jax.lit_clouds import load_lit_cloud
+from ginn_jax.lit_clouds import DENSE, load_lit_cloud
 from ginn_jax.lit_scenes import (
-    DENSEST,
     Illumination,
     Scattering,
     draw_albedo,
@@ -145,10 +144,10 @@ def test_materials_are_in_their_ranges(seed):
     assert albedo.max() <= 1
     np.testing.assert_array_equal(draw_albedo(seed), albedo)
     extinction, ior = draw_medium(albedo[0], seed, Scattering())
-    assert 1 <= extinction <= DENSEST
+    assert 1 <= extinction <= DENSE
     assert 1 <= ior <= 1.5
     twice = draw_medium(albedo[0], seed, Scattering(size=200.0))
-    np.testing.assert_allclose(twice, [min(2 * extinction, DENSEST), ior])
+    np.testing.assert_allclose(twice, [min(2 * extinction, DENSE), ior])
 
 
 def test_materials_are_drawn_as_the_paper_says():
