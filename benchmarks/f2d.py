@@ -20,7 +20,7 @@ import numpy as np
 
 from benchmarks.straightforward import shade_plainly
 from benchmarks.timing import Timing, circumstances, describe, measure
-from ginn_jax import blocks, image, inference, lit_scenes, objects, reference, report
+from ginn_jax import blocks, image, inference, objects, reference, report
 from ginn_jax.architecture import Network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
@@ -34,6 +34,7 @@ from ginn_jax.recipe import Training
 from ginn_jax.reference import GBuffer, Scene
 from ginn_jax.searches import uniform_limits
 from ginn_jax.train import init_state
+from ginn_jax.visible import visible_samples
 
 UNSEEN_SEED = 20_000_000
 # The paper's AO, whole network, 1024 x 1024, NVIDIA GTX 1080.
@@ -113,7 +114,7 @@ def compare(
     )
     state = init_state(Training(network, steps=1))
     variables = jax.device_put(state.variables, jax.devices()[0])
-    cloud = lit_scenes.visible_samples(scene, options.points, seed=0)
+    cloud = visible_samples(scene, options.points, seed=0)
     key = jax.random.key(0)
     # They have to be raised, so they end up close to the need.
     limits = uniform_limits(network, 1 << 12)

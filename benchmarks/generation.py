@@ -19,8 +19,10 @@ from ginn_jax import lit_scenes, objects, report
 from ginn_jax.commandline import require, start
 from ginn_jax.estimates import PATHS_PER_LAUNCH
 from ginn_jax.irradiance import LitScene, indirect_irradiance
+from ginn_jax.pairing import pair_up
 from ginn_jax.reference import OFFSET, build_scene, columns
 from ginn_jax.renderer import use_mitsuba
+from ginn_jax.visible import visible_samples
 
 UNSEEN_SEED = 20_000_000
 
@@ -79,7 +81,7 @@ def compare(options: Options, source: objects.Source) -> dict[str, Any]:
     settings = lit_scenes.Illumination(options.points, options.paths)
     lit = lit_scenes.light_up(source, settings)
     scene = build_scene(lit.scene.mesh)
-    cloud = lit_scenes.visible_samples(scene, options.points, source.seed)
+    cloud = visible_samples(scene, options.points, source.seed)
     ends = cloud.position, cloud.normal
     calls = {
         "bare": lambda: bare_loop(lit.scene, *ends, options.paths),
@@ -108,7 +110,7 @@ def main(options: Options) -> dict[str, Any]:
     count = options.scenes
     shapes = objects.procedural_sources(count, UNSEEN_SEED)
     lights = objects.procedural_lights(count, UNSEEN_SEED)
-    rows = [compare(options, s) for s in objects.pair_up(shapes, lights, 1)]
+    rows = [compare(options, s) for s in pair_up(shapes, lights, 1)]
     metrics = {"rows": rows} | circumstances(options, begin)
     heads = {"scene": "scene", "bare": "Mitsuba M paths/s", "ours": "ours M paths/s"}
     heads |= {"ours_over_bare": "ratio", "cloud": "whole cloud M paths/s"}

@@ -25,13 +25,8 @@ from ginn_jax.dataset import count_given
 from ginn_jax.evaluate import Model, pool_rows
 from ginn_jax.limits import Limits
 from ginn_jax.lit_clouds import LitCloud, split_points
-from ginn_jax.lit_experiment import (
-    LitOptions,
-    LitSettings,
-    Preset,
-    choose_sources,
-    with_exact_targets,
-)
+from ginn_jax.lit_experiment import LitSettings, with_exact_targets
+from ginn_jax.lit_options import LitOptions, Preset, choose_sources
 from ginn_jax.lit_scenes import Illumination, Scattering
 from ginn_jax.objects import Source
 from ginn_jax.presets import ILLUMINATION, SCATTERING

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from benchmarks.timing import Timing, circumstances, describe, measure
-from ginn_jax import inference, lit_scenes, objects, presets, reference, report
+from ginn_jax import inference, objects, presets, reference, report
 from ginn_jax.architecture import Network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.checkpoint import load_weights
@@ -31,6 +31,7 @@ from ginn_jax.relight import prepare_relighting, relight
 from ginn_jax.samples import Samples
 from ginn_jax.searches import uniform_limits
 from ginn_jax.train import init_state
+from ginn_jax.visible import visible_samples
 
 UNSEEN_SEED = 20_000_000
 
@@ -83,7 +84,7 @@ def lit_pair(options: Options, network: Network) -> tuple[LitCloud, LitCloud]:
     scene = reference.build_scene(objects.load_object(source, ground=not scatters))
     size = options.resolution
     seen = reference.render_gbuffer(scene, orbit_camera(width=size, height=size))
-    cloud = lit_scenes.visible_samples(scene, options.points, 0, not scatters)
+    cloud = visible_samples(scene, options.points, 0, not scatters)
     pixels = Samples(
         *(a[seen.mask] for a in (seen.position, seen.normal, seen.material))
     )

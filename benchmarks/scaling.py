@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.f2d import UNSEEN_SEED, block_memory
 from benchmarks.timing import Timing, circumstances, describe, measure
-from ginn_jax import image, inference, lit_scenes, objects, reference, report
+from ginn_jax import image, inference, objects, reference, report
 from ginn_jax.architecture import Network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
@@ -28,6 +28,7 @@ from ginn_jax.recipe import Training
 from ginn_jax.samples import sample_surface
 from ginn_jax.searches import uniform_limits
 from ginn_jax.train import init_state
+from ginn_jax.visible import visible_samples
 
 # Of the cloud under the frames.
 FRAME_POINTS = 16_000
@@ -88,7 +89,7 @@ def over_pixels(options: Options, scene: reference.Scene) -> list[dict[str, Any]
     """f_2D, for frames of each size; its scratch memory is that of a block."""
     network = network_for(FRAME_POINTS)
     variables = weights_of(network)
-    cloud = lit_scenes.visible_samples(scene, FRAME_POINTS, seed=0)
+    cloud = visible_samples(scene, FRAME_POINTS, seed=0)
     limits = uniform_limits(network, 1 << 17)
     encoded, limits = inference.encode_cloud(
         network,

@@ -27,14 +27,16 @@ from ginn_jax.lighting import (
     procedural_environment,
 )
 from ginn_jax.lit_clouds import mean_light
-from ginn_jax.lit_scenes import Scattering, light_mesh, lit_points, visible_samples
+from ginn_jax.lit_scenes import Scattering, light_mesh, lit_points
 from ginn_jax.mesh import add_ground, fit_unit_box, load_mesh
 from ginn_jax.metrics import tone_map
 from ginn_jax.objects import UNSEEN_SEED, random_point_light, tell_apart
+from ginn_jax.pairing import spread
 from ginn_jax.pretrained import load_network
 from ginn_jax.reference import build_scene
 from ginn_jax.relight import Relightable, prepare_relighting, relight
 from ginn_jax.shapes import random_shape
+from ginn_jax.visible import visible_samples
 
 
 @dataclass(frozen=True)
@@ -129,11 +131,10 @@ def choose_lights(options: Options) -> dict[str, Light]:
     if options.envmaps is None:
         for seed in range(first, first + options.lights):
             lights[f"sky {seed}"] = procedural_environment(seed)
-    elif options.lights:
+    else:
         paths = find_environments(options.envmaps)
-        step = max(len(paths) // options.lights, 1)
-        named = list(zip(tell_apart(paths), paths, strict=True))[::step]
-        for name, path in named[: options.lights]:
+        named = list(zip(tell_apart(paths), paths, strict=True))
+        for name, path in spread(named, options.lights):
             lights[name] = load_environment(path)
     for seed in range(options.point_lights):
         lights[f"point light {seed}"] = random_point_light(first + seed)

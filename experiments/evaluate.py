@@ -18,7 +18,7 @@ from rich.console import Console
 from ginn_jax import compare, compare_report, report
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
-from ginn_jax.compare import Picture, Shot
+from ginn_jax.compare import Compared, Picture, Shot
 from ginn_jax.compare_networks import (
     NETWORKS,
     OURS,
@@ -121,12 +121,11 @@ def main(options: Options) -> dict[str, Any]:
     rows, front_rows, shown, light = [], [], [], []
     for source, cloud in zip(sources, clouds, strict=True):
         console.print(f"{source.name}")
-        found = compare_scene(options, settings, source, cloud, networks)
-        rows += found[0]
-        front_rows += found[1]
-        shown.append((source.name, found[2]))
-        light.append(found[3])
-        networks = found[4]
+        found, networks = compare_scene(options, settings, source, cloud, networks)
+        rows += found.rows
+        front_rows += found.front
+        shown.append((source.name, found.shown))
+        light.append(found.light)
     memory = {
         name: network_memory(networks[name], count_given(settings.points))
         for name in NETWORKS
@@ -155,12 +154,8 @@ def compare_scene(
     source: Source,
     cloud: Any,
     networks: dict[str, Trained],
-) -> tuple[list[Row], list[Row], dict[str, np.ndarray], Row, dict[str, Trained]]:
-    """All methods on all views of a scene.
-
-    Rows of the table, rows of error against run time, pictures of the first view, and
-    what its direct light took.
-    """
+) -> tuple[Compared, dict[str, Trained]]:
+    """All methods on all views of a scene, and the networks with limits that do."""
     stage = compare.set_stage(source, settings)
     given, units = points_given(cloud)
     rows, front, shown, light = [], [], {}, {}
@@ -190,7 +185,7 @@ def compare_scene(
             front += rivals(options, settings, shot, given, own, networks, units)
             rates = {OURS + at_scale(scale) for scale in (1.0, *options.scales)}
             front += [codes_kept(row) for row in front if row["method"] in rates]
-    return rows, front, shown, light, networks
+    return Compared(rows, front, shown, light), networks
 
 
 def rivals(

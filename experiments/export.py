@@ -22,7 +22,8 @@ from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model
 from ginn_jax.limits import Limits
 from ginn_jax.lit_scenes import lit_cloud
-from ginn_jax.objects import load_object, pair_up, procedural_lights, procedural_sources
+from ginn_jax.objects import load_object, procedural_lights, procedural_sources
+from ginn_jax.pairing import pair_up
 from ginn_jax.pretrained import FOLDER, export
 from ginn_jax.scenes import Occlusion, occlusion_cloud
 

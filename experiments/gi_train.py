@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from ginn_jax.commandline import start
-from ginn_jax.lit_experiment import QUICK, LitOptions, Preset, run_experiment
+from ginn_jax.lit_experiment import run_experiment
+from ginn_jax.lit_options import QUICK, LitOptions, Preset
 from ginn_jax.lit_scenes import Illumination
 from ginn_jax.presets import ILLUMINATION
 

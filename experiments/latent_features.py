@@ -22,13 +22,14 @@ from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
 from ginn_jax.lighting import procedural_environment
 from ginn_jax.lit_clouds import network_numbers
-from ginn_jax.lit_scenes import light_mesh, lit_points, visible_samples
+from ginn_jax.lit_scenes import light_mesh, lit_points
 from ginn_jax.mesh import Mesh, add_ground, fit_unit_box, load_mesh
 from ginn_jax.objects import UNSEEN_SEED
 from ginn_jax.pretrained import load_network
 from ginn_jax.reference import GBuffer, build_scene, render_gbuffer
 from ginn_jax.scenes import Occlusion
 from ginn_jax.shapes import random_shape
+from ginn_jax.visible import visible_samples
 
 AZIMUTHS = (35.0, 155.0)
 

@@ -13,7 +13,8 @@ from typing import Any
 
 from ginn_jax.commandline import start
 from ginn_jax.errors import InputError
-from ginn_jax.lit_experiment import QUICK, LitOptions, Preset, run_experiment
+from ginn_jax.lit_experiment import run_experiment
+from ginn_jax.lit_options import QUICK, LitOptions, Preset
 from ginn_jax.lit_scenes import Scattering
 from ginn_jax.presets import SCATTERING
 

@@ -18,13 +18,15 @@ Modules, in the order the data flows; each imports only what stands before it:
     camera            pinhole cameras
     libllvm, renderer the ray tracer, found and loaded
     reference         ambient occlusion and G-buffers by ray tracing
+    visible           samples of the surface that light can reach
     radiance_files    what the renderer does not check of a map's file
     lighting          environment maps, procedural skies and studios, point lights
     estimates         rays dealt out to lanes, their mean and variance
     irradiance        direct and indirect irradiance by path tracing
     slab              albedo of a thick slab of a medium, and its inverse
     subsurface        radiant exitance by random walks in a medium
-    objects           which objects and lights there are, and which go together
+    objects           where objects and lights come from
+    pairing           which of them go together, and what for
     ranges            ranges of rows expanded to lists, tile by tile
     voxels            points sorted by voxel, found by binary search under jit
     candidates        points that packets of queries may be near
@@ -84,6 +86,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     animation_report  flicker, strip, moving image and report.md of animations
     occlusion_report  report.md of the experiment of ambient occlusion
     lit_report        report.md of effects that carry light
+    lit_options       what an experiment with light is told; its objects and lights
     lit_experiment    what the experiments of effects that carry light share
 
 Shape letters: N source points, M queries, E edges, C channels, D kernel inputs,

@@ -28,10 +28,10 @@ from ginn_jax.objects import (
     file_lights,
     file_sources,
     load_object,
-    pair_up,
     procedural_lights,
     procedural_sources,
 )
+from ginn_jax.pairing import pair_up, spread
 from ginn_jax.reference import Estimate
 from ginn_jax.samples import Samples
 from ginn_jax.scenes import Occlusion, Settings
@@ -51,6 +51,21 @@ class Picture(NamedTuple):
     values: Values
 
 
+class Compared(NamedTuple):
+    """What all methods made of a scene.
+
+    rows   the table, a row for each method and view
+    front  error against run time, in the first view
+    shown  the first view's pictures
+    light  seconds that its direct light took
+    """
+
+    rows: list[Row]
+    front: list[Row]
+    shown: dict[str, np.ndarray]
+    light: Row
+
+
 def unseen_sources(
     effect: str, count: int, meshes: Path | None, envmaps: Path | None, *, seed: int
 ) -> list[Source]:
@@ -64,7 +79,7 @@ def unseen_sources(
         if meshes is None
         else file_sources(find_meshes(meshes))
     )
-    objects = objects[:: max(len(objects) // count, 1)][:count]
+    objects = spread(objects, count)
     if effect == "ao":
         return objects
     lights = (
@@ -72,7 +87,7 @@ def unseen_sources(
         if envmaps is None
         else file_lights(find_environments(envmaps))
     )
-    return pair_up(objects, lights[:: max(len(lights) // count, 1)], 1)
+    return pair_up(objects, spread(lights, count), 1)
 
 
 def set_stage(source: Source, settings: Settings) -> Stage:

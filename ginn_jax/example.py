@@ -120,12 +120,21 @@ def numbers(
     """Material and light of some rows, zero where masked; the light as the mean over
     the samples around, if `facets` are given."""
     material, light = (
-        None if a is None else jnp.where(mask[:, None], a[rows], 0.0)
-        for a in (cloud.material, cloud.light)
+        None if a is None else a[rows] for a in (cloud.material, cloud.light)
     )
+    material, light = real_rows((material, light), mask)
     if facets is not None and light is not None and cloud.light is not None:
         light = facet_means(facets, cloud.light, light)
     return material, light
+
+
+def real_rows(
+    columns: tuple[Array | None, Array | None], mask: Bool[Array, "M"]
+) -> tuple[Array | None, ...]:
+    """What there is, zero where masked."""
+    return tuple(
+        None if a is None else jnp.where(mask[:, None], a, 0.0) for a in columns
+    )
 
 
 def points_asked(

@@ -1,10 +1,9 @@
-"""What the experiments of effects that carry light share: options, run, report."""
+"""What the experiments of effects that carry light share: run, evaluation, report."""
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any, Literal
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from typing import Any
 
 import jax
 import numpy as np
@@ -16,67 +15,24 @@ from ginn_jax.dataset import count_asked, count_given
 from ginn_jax.evaluate import Model, fill, mean_rows, pool_rows
 from ginn_jax.experiment import (
     Clock,
-    RunOptions,
     check_run,
     closing,
     make,
     train,
     training,
 )
-from ginn_jax.lighting import find_environments
 from ginn_jax.lit_clouds import LitCloud, split_points, unit_floor
+from ginn_jax.lit_options import LitOptions, choose_sources
 from ginn_jax.lit_report import halves_by_medium, write_report
 from ginn_jax.lit_scenes import Illumination, Scattering
-from ginn_jax.mesh import find_meshes
 from ginn_jax.metrics import relative_error
-from ginn_jax.objects import (
-    PAPER_SPLIT,
-    SEEDS_APART,
-    UNSEEN_SEED,
-    LightSource,
-    Source,
-    file_lights,
-    file_sources,
-    mixed,
-    pair_up,
-    point_lights,
-    procedural_lights,
-    procedural_sources,
-    split_apart,
-)
+from ginn_jax.objects import Source
+from ginn_jax.pairing import PAPER_SPLIT
 from ginn_jax.recipe import Training
 
 VALIDATION_PATHS = 512
 PATH_COUNTS = (1, 4, 16, 64)
 LitSettings = Illumination | Scattering
-Preset = Literal["homogeneous", "linear", "released", "only_2d", "only_3d"]
-
-
-@dataclass(frozen=True)
-class LitOptions(RunOptions):
-    """What every effect that carries light can be told."""
-
-    envmaps: Path | None = None
-    """An environment map or a folder of them to train under as well, each once or
-    more where there are as many objects."""
-    lights: int = 1
-    """Lights for every object."""
-    test_envmaps: Path | None = None
-    """Unseen environment maps to evaluate under, instead of procedural ones."""
-    split: Literal["default", "paper"] = "default"
-    """The paper's: 1,000 x 20, 200 x 5 and 500 x 5 objects and lights, 4,096 paths."""
-    paths: int = 32
-    """Paths per training point."""
-
-
-QUICK = {
-    "shapes": 4,
-    "test_shapes": 2,
-    "steps": 10,
-    "points": 4000,
-    "resolution": 64,
-    "paths": 4,
-}
 
 
 def run_experiment(
@@ -124,49 +80,6 @@ def with_exact_targets(settings: LitSettings, quick: bool) -> LitSettings:
     """The same with targets to measure by, at the points where networks are asked."""
     paths = 16 if quick else max(settings.paths, VALIDATION_PATHS)
     return replace(settings, paths=paths, targets=count_asked(settings.points))
-
-
-def choose_sources(
-    options: LitOptions,
-) -> tuple[list[Source], dict[str, list[Source]]]:
-    """Objects under lights to train on, and those, by name of the set, to test on."""
-    seed, each = options.seed, options.lights
-    objects = procedural_sources(options.shapes, seed * SEEDS_APART)
-    objects += _files(options.meshes, find_meshes, file_sources)
-    lights = procedural_lights(max(options.shapes, 30), seed * SEEDS_APART)
-    maps = _files(options.envmaps, find_environments, file_lights)
-    if options.split == "paper":
-        return paper_sources(options, objects, lights + maps)
-    lights = mixed(lights, maps, len(objects) * each, seed)
-    unseen = procedural_sources(options.test_shapes, UNSEEN_SEED + seed)
-    skies: list[LightSource] = _files(
-        options.test_envmaps, find_environments, file_lights
-    ) or procedural_lights(options.test_shapes, UNSEEN_SEED + seed)
-    sets = {"shapes": pair_up(unseen, skies, 1)}
-    lamps = point_lights(4, UNSEEN_SEED + seed)
-    sets["point lights"] = pair_up(unseen[:4], lamps, 1)
-    if files := _files(options.test_meshes, find_meshes, file_sources):
-        sets["meshes"] = pair_up(files, skies, 1)
-    return pair_up(objects, lights, each), sets
-
-
-def _files(path: Path | None, find: Callable, name: Callable) -> list[Any]:
-    return [] if path is None else name(find(path))
-
-
-def paper_sources(
-    options: LitOptions, objects: Sequence[Source], lights: Sequence[LightSource]
-) -> tuple[list[Source], dict[str, list[Source]]]:
-    """The paper's split of these objects and lights; validation and test are unseen."""
-    split = PAPER_SPLIT
-    parts = split.train, split.validation, split.test
-    objects_of = split_apart(objects, [count for count, _ in parts], options.seed)
-    lights_of = split_apart(lights, [count for _, count in parts], options.seed)
-    seen, validation, test = (
-        pair_up(o, lit, count)
-        for o, lit, (_, count) in zip(objects_of, lights_of, parts, strict=True)
-    )
-    return seen, {"validation": validation, "test": test}
 
 
 def evaluation(

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from ginn_jax.checks import positive, whole
-from ginn_jax.errors import InputError, InputWarning
+from ginn_jax.errors import InputWarning
 from ginn_jax.estimates import ColorEstimate
 from ginn_jax.irradiance import (
     LitScene,
@@ -24,13 +24,12 @@ from ginn_jax.lighting import Light
 from ginn_jax.lit_clouds import DENSE, LitCloud
 from ginn_jax.mesh import Mesh
 from ginn_jax.objects import Source, load_light, load_object
-from ginn_jax.reference import Scene, ambient_occlusion, build_scene
-from ginn_jax.samples import Samples, sample_surface
+from ginn_jax.reference import build_scene
+from ginn_jax.samples import Samples
 from ginn_jax.slab import single_scattering_albedo
 from ginn_jax.subsurface import Medium, subsurface_exitance
+from ginn_jax.visible import visible_samples
 
-FAR, PROBE_RAYS = 100.0, 32
-OBJECT = 0  # the material of what stands on the ground
 # The share of lost walks from which on a mesh is said not to hold its medium.
 MOST_LOST = 0.05
 
@@ -181,54 +180,3 @@ def lit_points(lit: Lit, samples: Samples, looks: int, *, seed: int) -> LitCloud
     )
     light = irradiance, np.zeros_like(irradiance), np.zeros_like(irradiance)
     return LitCloud(position, normal, material, *light, lit.albedo, lit.medium)
-
-
-def visible_samples(
-    scene: Scene, count: int, seed: int, both_sides: bool = True
-) -> Samples:
-    """Uniform samples of the surface that light can reach, on both its sides.
-
-    Meshes of many parts hide surface inside other parts, where no camera can be; it
-    would only take points away from what is seen. A sample is dropped if none of
-    `PROBE_RAYS` rays from it leaves the scene. So the inside of what is closed is
-    dropped, and a sheet without thickness has samples with normals to either side, as
-    a camera sees it; unless `both_sides` is off. The ground has one side.
-
-    Raises:
-        InputError: a scene that is almost all sealed off.
-    """
-    drawn = 5 * count // 2
-    for _ in range(5):
-        samples = sample_sides(scene.mesh, drawn, seed, both_sides)
-        seen = reached_by_light(scene, samples, seed)
-        if len(seen) >= count:
-            return Samples(*(a[seen[:count]] for a in samples))
-        drawn = 2 * drawn
-    raise InputError("nearly all of the mesh's surface is sealed inside it: mend it")
-
-
-def sample_sides(mesh: Mesh, count: int, seed: int, both_sides: bool) -> Samples:
-    """At most `count` uniform samples; the normals of the object's to either side."""
-    position, normal, material = sample_surface(mesh, count, seed=seed)
-    behind, kept = draw_sides(material, both_sides, seed)
-    normal = np.where(behind[:, None], -normal, normal)
-    return Samples(position[kept], normal[kept], material[kept])
-
-
-def draw_sides(
-    material: Int[np.ndarray, "N"], both_sides: bool, seed: int
-) -> tuple[Bool[np.ndarray, "N"], Bool[np.ndarray, "N"]]:
-    """Which samples are of the back of their face, and which to keep of all.
-
-    Half are of the back where both sides count, but what is under the ground is not.
-    """
-    drawn = np.random.default_rng((seed, 7)).random(len(material)) < 0.5
-    behind = drawn & both_sides
-    return behind, ~behind | (material == OBJECT)
-
-
-def reached_by_light(scene: Scene, samples: Samples, seed: int) -> Int[np.ndarray, "K"]:
-    """The samples from which at least one of `PROBE_RAYS` rays leaves the scene."""
-    ends = samples.position, samples.normal
-    sky = ambient_occlusion(scene, *ends, FAR, rays=PROBE_RAYS, seed=seed)
-    return np.flatnonzero(sky.mean > 0)

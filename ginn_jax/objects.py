@@ -1,18 +1,16 @@
-"""Where objects and lights come from: seeds and files, and which belong together."""
+"""Where objects and lights come from: seeds and files."""
 
 import json
 import warnings
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
 
-from ginn_jax.checks import LARGEST_SEED, whole
 from ginn_jax.errors import InputError, InputWarning
 from ginn_jax.lighting import (
     Light,
@@ -24,7 +22,6 @@ from ginn_jax.lighting import (
 from ginn_jax.mesh import Mesh, add_ground, fit_unit_box, load_mesh
 from ginn_jax.shapes import SHAPES, random_shape
 
-T = TypeVar("T")
 # Seeds of what is trained on lie below UNSEEN_SEED, `SEEDS_APART` for each --seed.
 SEEDS_APART, UNSEEN_SEED = 100_000, 10_000_000
 
@@ -47,39 +44,6 @@ class Source:
     path: str | None
     seed: int
     light: LightSource | None = None
-
-
-@dataclass(frozen=True)
-class Split:
-    """How many objects, each under how many lights, to train, validate and test on.
-
-    No object and no light is in two of the three.
-    """
-
-    train: tuple[int, int]
-    validation: tuple[int, int]
-    test: tuple[int, int]
-    points: int
-    paths: int
-
-
-# Section "Training Data Generation" of the paper: sizes, points and rays of GI and SSS.
-PAPER_SPLIT = Split((1000, 20), (200, 5), (500, 5), 20_000, 4096)
-
-
-def split_apart(items: Sequence[T], counts: Sequence[int], seed: int) -> list[list[T]]:
-    """Disjoint random parts of a list, of so many items each.
-
-    Raises `InputError` where there are too few.
-    """
-    if len(items) < sum(counts):
-        raise InputError(
-            f"a split into {', '.join(map(str, counts))} needs {sum(counts)} objects "
-            f"or lights, there are {len(items)}: give more"
-        )
-    order = np.random.default_rng((seed, 6)).permutation(len(items))
-    stops = np.cumsum([0, *counts])
-    return [[items[i] for i in sorted(order[a:b])] for a, b in pairwise(stops)]
 
 
 def procedural_sources(count: int, first_seed: int) -> list[Source]:
@@ -135,36 +99,6 @@ def file_lights(paths: Sequence[Path]) -> list[LightSource]:
         LightSource(name, str(path), i)
         for i, (name, path) in enumerate(zip(tell_apart(paths), paths, strict=True))
     ]
-
-
-def pair_up(
-    objects: Sequence[Source], lights: Sequence[LightSource], each: int
-) -> list[Source]:
-    """Every object under `each` of the lights, in turns, so that all are used."""
-    if not lights:
-        raise InputError("no lights: give environment maps, or ask for procedural ones")
-    each = min(whole("lights for each object", each, 1, LARGEST_SEED), len(lights))
-    pairs = []
-    for i, source in enumerate(objects):
-        for k in range(each):
-            light = lights[(i * each + k) % len(lights)]
-            name = f"{source.name}__{light.name}"
-            seed = source.seed * each + k
-            if source.path is not None:
-                seed = zlib.crc32(name.encode())
-            pairs.append(replace(source, name=name, light=light, seed=seed))
-    return pairs
-
-
-def mixed(
-    lights: Sequence[LightSource], maps: Sequence[LightSource], pairs: int, seed: int
-) -> list[LightSource]:
-    """Lights for so many pairs, those of files among them at random places."""
-    if not maps:
-        return list(lights)
-    both = [*lights[: max(pairs - len(maps), 0)], *maps]
-    order = np.random.default_rng((seed, 7)).permutation(len(both))
-    return [both[i] for i in order]
 
 
 def load_object(source: Source, ground: bool = True) -> Mesh:

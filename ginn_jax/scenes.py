@@ -10,11 +10,12 @@ from typing import Any
 from ginn_jax.dataset import ShadedPoints, load_cloud, save_cloud
 from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import Cloud, load_lit_cloud, save_lit_cloud
-from ginn_jax.lit_scenes import Illumination, Scattering, lit_cloud, visible_samples
+from ginn_jax.lit_scenes import Illumination, Scattering, lit_cloud
 from ginn_jax.mesh import Mesh
 from ginn_jax.objects import Source, load_object, origin_of
 from ginn_jax.process import end_with_parent
 from ginn_jax.reference import ambient_occlusion, build_scene
+from ginn_jax.visible import visible_samples
 
 # Bounds what a renderer could leak in one process. Not by `max_tasks_per_child`, with
 # which a pool may wait forever for a process that it does not start (python/cpython

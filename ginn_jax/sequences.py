@@ -12,11 +12,11 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 
 from ginn_jax.errors import InputError
-from ginn_jax.lit_scenes import draw_sides, reached_by_light
 from ginn_jax.mesh import Mesh, add_ground, fit_unit_box
 from ginn_jax.reference import build_scene
 from ginn_jax.samples import Samples
 from ginn_jax.shapes import random_shape
+from ginn_jax.visible import draw_reached, draw_sides
 
 
 class Animation(NamedTuple):
@@ -121,20 +121,22 @@ def carried_samples(
 
     On both sides of the object's faces, unless `both_sides` is off, and above the
     ground, as `visible_samples` are.
+
+    Raises:
+        InputError: a scene that is almost all sealed off.
     """
     shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    drawn = 5 * count
-    place, face = trimesh.sample.sample_surface(shape, drawn, seed=seed)[:2]
-    behind, kept = draw_sides(mesh.material[face], both_sides, seed)
-    place, face, behind = place[kept], face[kept], behind[kept]
-    corners = mesh.vertices[mesh.faces[face]]
-    barycentric = trimesh.triangles.points_to_barycentric(corners, place)
-    carried = Carried(face.astype(np.int32), barycentric.astype(np.float32), behind)
-    samples = samples_at(mesh, carried)
-    seen = reached_by_light(build_scene(mesh), samples, seed)[:count]
-    if len(seen) < count:
-        raise InputError("nearly all of the surface is sealed inside: mend the mesh")
-    return Carried(*(a[seen] for a in carried))
+
+    def draw(drawn: int) -> tuple[Carried, Samples]:
+        place, face = trimesh.sample.sample_surface(shape, drawn, seed=seed)[:2]
+        behind, kept = draw_sides(mesh.material[face], both_sides, seed)
+        place, face, behind = place[kept], face[kept].astype(np.int32), behind[kept]
+        corners = mesh.vertices[mesh.faces[face]]
+        barycentric = trimesh.triangles.points_to_barycentric(corners, place)
+        carried = Carried(face, barycentric.astype(np.float32), behind)
+        return carried, samples_at(mesh, carried)
+
+    return draw_reached(draw, build_scene(mesh), count, seed)
 
 
 def samples_at(mesh: Mesh, carried: Carried) -> Samples:

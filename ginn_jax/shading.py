@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from ginn_jax.architecture import Network
 from ginn_jax.candidates import DENSE_PACKET, PACKET
 from ginn_jax.dataset import safe_inverse, unit_light
-from ginn_jax.example import numbers_asked, points_asked, queries_asked
+from ginn_jax.example import numbers_asked, points_asked, queries_asked, real_rows
 from ginn_jax.facets import Around, smooth_light, smooth_queries
 from ginn_jax.geometry import Geometry, build_geometry, build_query_field
 from ginn_jax.limits import Demands, Limits
@@ -241,12 +241,3 @@ def take_rows(
 ) -> Float[Array, "C M A"] | None:
     """Rows of what there is, or all in their order."""
     return numbers if numbers is None or rows is None else numbers[:, rows]
-
-
-def real_rows(
-    columns: tuple[Array | None, Array | None], mask: Bool[Array, "M"]
-) -> tuple[Array | None, ...]:
-    """What there is, zero where masked."""
-    return tuple(
-        None if a is None else jnp.where(mask[:, None], a, 0.0) for a in columns
-    )

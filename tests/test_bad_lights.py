@@ -14,6 +14,7 @@ from ginn_jax import (
     lighting,
     lit_scenes,
     objects,
+    pairing,
     slab,
     subsurface,
 )
@@ -152,7 +153,7 @@ TABLE: Table = {
         ({"absorption": 0.0}, "absorption 0.0 must be positive"),
         ({"targets": 30_000}, "targets 30000 must be from 1 to 20000"),
     ],
-    objects.pair_up: [
+    pairing.pair_up: [
         (([], [], 1), "no lights: give environment maps"),
         (([], objects.point_lights(2, 0), 0), "lights for each object 0 must be"),
     ],

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -11,9 +12,10 @@ import tiny
 from benchmarks import generation
 from benchmarks import relight as relight_benchmark
 from experiments import gi_train, sss_train
-from ginn_jax import blocks, evaluate_light, lit_experiment, presets, scenes
+from ginn_jax import blocks, evaluate_light, presets, scenes
 from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import LitCloud
+from ginn_jax.lit_options import LitOptions, choose_sources
 from ginn_jax.room import Room
 from ginn_jax.searches import uniform_limits
 from ginn_jax.shading import Encoded
@@ -84,8 +86,8 @@ def test_seen_and_unseen_share_no_object_and_no_light(tmp_path):
     maps = tmp_path / "maps"
     maps.mkdir()
     (maps / "a.hdr").write_bytes(b"seen")
-    options = lit_experiment.LitOptions(shapes=40, envmaps=maps, lights=2)
-    seen, unseen = lit_experiment.choose_sources(options)
+    options = LitOptions(shapes=40, envmaps=maps, lights=2)
+    seen, unseen = choose_sources(options)
     assert len(seen) == 80
     assert len({s.name for s in seen}) == 80
     tests = [s for sources in unseen.values() for s in sources]
@@ -103,28 +105,39 @@ def test_every_map_lights_something(tmp_path, each):
     maps.mkdir()
     for i in range(20):
         (maps / f"map_{i}.hdr").write_bytes(b"seen")
-    options = lit_experiment.LitOptions(shapes=40, envmaps=maps, lights=each)
-    seen, _ = lit_experiment.choose_sources(options)
+    options = LitOptions(shapes=40, envmaps=maps, lights=each)
+    seen, _ = choose_sources(options)
     used = [s.light.path for s in seen]
     assert len({path for path in used if path}) == 20
     assert None in used
-    again, _ = lit_experiment.choose_sources(options)
-    other, _ = lit_experiment.choose_sources(replace(options, seed=1))
+    again, _ = choose_sources(options)
+    other, _ = choose_sources(replace(options, seed=1))
     assert [s.light.path for s in again] == used
     assert [s.light.path for s in other] != used
 
 
+def test_unseen_maps_are_spread_over_the_folder(tmp_path):
+    """Few shapes see the last maps as well as the first; shapes in turns see all."""
+    for i in range(9):
+        (tmp_path / f"map_{i}.hdr").write_bytes(b"unseen")
+    for count, wanted in ((3, "036"), (9, "012345678"), (11, "01234567801")):
+        options = LitOptions(shapes=40, test_envmaps=tmp_path, test_shapes=count)
+        _, unseen = choose_sources(options)
+        used = [Path(s.light.path).stem for s in unseen["shapes"]]
+        assert used == [f"map_{digit}" for digit in wanted]
+
+
 def test_without_maps_shapes_keep_their_skies():
     """What was made of them before is found again."""
-    seen, _ = lit_experiment.choose_sources(lit_experiment.LitOptions(shapes=40))
+    seen, _ = choose_sources(LitOptions(shapes=40))
     assert [s.name for s in seen] == [f"shape_{i}__sky_{i}" for i in range(40)]
 
 
 def test_the_papers_split_says_what_it_lacks():
-    options = lit_experiment.LitOptions(shapes=40, split="paper")
+    options = LitOptions(shapes=40, split="paper")
     with pytest.raises(InputError, match="1700"):
-        lit_experiment.choose_sources(options)
-    seen, unseen = lit_experiment.choose_sources(replace(options, shapes=1700))
+        choose_sources(options)
+    seen, unseen = choose_sources(replace(options, shapes=1700))
     assert len(seen) == 1000 * 20
     assert [len(s) for s in unseen.values()] == [200 * 5, 500 * 5]
     lights = [{s.light.name for s in part} for part in (seen, *unseen.values())]

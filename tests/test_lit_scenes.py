@@ -27,10 +27,10 @@ from ginn_jax.objects import (
     file_sources,
     load_light,
     load_object,
-    pair_up,
     point_lights,
     procedural_lights,
 )
+from ginn_jax.pairing import pair_up
 from ginn_jax.scenes import cloud_origin, cloud_path, make_cloud, read_clouds
 
 SMALL = {"points": 300, "paths": 4, "looks": 16}

@@ -12,17 +12,15 @@ from strategies import SEEDS
 from ginn_jax.errors import InputError
 from ginn_jax.mesh import find_meshes
 from ginn_jax.objects import (
-    PAPER_SPLIT,
     file_sources,
     load_object,
-    pair_up,
     point_lights,
     procedural_lights,
     procedural_sources,
     shape_seed,
-    split_apart,
     tell_apart,
 )
+from ginn_jax.pairing import PAPER_SPLIT, pair_up, split_apart, spread
 
 WORD = st.text("ab_0", min_size=1, max_size=3)
 PATHS = st.lists(
@@ -94,6 +92,17 @@ def test_same_name_with_other_endings_is_numbered():
 
 
 # Splits
+
+
+@given(st.lists(st.integers(), max_size=40, unique=True), st.integers(0, 50))
+def test_spread_takes_so_many_at_even_steps(items, count):
+    taken = spread(items, count)
+    assert len(taken) == min(count, len(items))
+    places = [items.index(item) for item in taken]
+    steps = np.diff([*places, len(items)]) if places else np.array([1])
+    assert places[:1] in ([], [0])
+    assert steps.min() > 0
+    assert steps.max() - steps.min() <= 1
 
 
 @given(

@@ -1,6 +1,7 @@
 """Trained networks that come with the package: they load, and are the ones measured."""
 
 import json
+import shutil
 from contextlib import nullcontext
 from functools import cache
 
@@ -49,6 +50,18 @@ def test_weights_come_back_bit_for_bit(exported):
     assert (config, dict(limits.sizes)) == (tiny.CONFIG, dict(tiny.LIMITS.sizes))
     assert tiny.identical(weights, jax.device_get(state.variables))
     assert pretrained.load_manifest(folder)["ao"]["errors"]
+
+
+def test_errors_are_named_by_their_set(exported, tmp_path):
+    """Of the paper's split, the first set is not of shapes alone."""
+    _, _, run = exported
+    shutil.copytree(run, tmp_path / "run")
+    path = tmp_path / "run" / "metrics.json"
+    first = json.loads(path.read_text())
+    sets = {f"unseen {name}": first for name in ("validation", "test")}
+    path.write_text(json.dumps(first | sets))
+    pretrained.export(tmp_path / "run", "ao", {}, tmp_path)
+    assert set(pretrained.load_manifest(tmp_path)["ao"]["errors"]) == set(sets)
 
 
 @pytest.mark.parametrize("begun", ["None", "runs/first"])

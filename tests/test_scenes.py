@@ -7,12 +7,13 @@ import pytest
 import tiny
 import trimesh
 
-from ginn_jax import lit_scenes, objects, scenes
+from ginn_jax import objects, scenes
 from ginn_jax.dataset import load_cloud
 from ginn_jax.errors import InputError
 from ginn_jax.mesh import add_ground, make_mesh
 from ginn_jax.reference import build_scene
 from ginn_jax.shapes import random_shape
+from ginn_jax.visible import visible_samples
 
 SETTINGS = scenes.Occlusion(points=300, rays=4, radius=0.2)
 
@@ -57,7 +58,7 @@ def test_object_fills_its_unit_box_on_the_ground(sources):
 def test_no_sample_lies_under_a_flat_base(sources):
     """Not on the crate's bottom, where it stands, nor on the ground under it."""
     mesh = objects.load_object(sources[0])
-    samples = lit_scenes.visible_samples(build_scene(mesh), 3000, seed=1)
+    samples = visible_samples(build_scene(mesh), 3000, seed=1)
     low = mesh.vertices[:, 1].min()
     near = samples.position[:, 1] < low + 0.01
     assert (samples.normal[near, 1] >= 0).all()
@@ -229,7 +230,7 @@ def nested_boxes(path, sides):
 def test_visible_samples_are_of_the_outside_only(tmp_path):
     """The inner cube has as much as 49 parts in 100 of the area of the outer one."""
     scene = nested_boxes(tmp_path / "two.ply", (1.0, 0.7))
-    samples = lit_scenes.visible_samples(scene, 2000, seed=3)
+    samples = visible_samples(scene, 2000, seed=3)
     assert samples.position.shape == samples.normal.shape == (2000, 3)
     assert len(samples.material) == 2000
     cube = np.flatnonzero(samples.material == 0)
@@ -246,12 +247,12 @@ def test_a_sheet_is_sampled_from_both_sides_and_the_ground_from_above():
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
     sheet = make_mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
     scene = build_scene(add_ground(sheet))
-    samples = lit_scenes.visible_samples(scene, 2000, seed=1)
+    samples = visible_samples(scene, 2000, seed=1)
     ground = samples.material == 1
     np.testing.assert_allclose(samples.normal[ground], [[0, 1, 0]] * ground.sum())
     front = samples.normal[~ground, 2] > 0
     assert 0.4 < front.mean() < 0.6
-    one = lit_scenes.visible_samples(scene, 2000, seed=1, both_sides=False)
+    one = visible_samples(scene, 2000, seed=1, both_sides=False)
     assert (one.normal[one.material == 0, 2] > 0.5).all()
     # As dense as the ground: a side has 1 of area, the ground 1.6 squared.
     assert ground.mean() == pytest.approx(2.56 / 4.56, abs=0.05)
@@ -260,4 +261,4 @@ def test_a_sheet_is_sampled_from_both_sides_and_the_ground_from_above():
 def test_a_scene_that_is_sealed_is_refused(tmp_path):
     scene = nested_boxes(tmp_path / "many.ply", np.linspace(1, 0.9, 200))
     with pytest.raises(InputError, match=r"^[^\n]*sealed[^\n]*$"):
-        lit_scenes.visible_samples(scene, 100, seed=0)
+        visible_samples(scene, 100, seed=0)

@@ -65,6 +65,21 @@ def test_a_sheet_is_sampled_on_both_sides_and_what_is_inside_out_outside():
     assert ((samples.position * samples.normal).sum(axis=1) > 0).all()
 
 
+def test_samples_of_nested_boxes_are_of_the_outermost_alone():
+    """Most of what is drawn first lies inside: more is drawn until there are enough."""
+    boxes = [trimesh.creation.box((side,) * 3) for side in np.linspace(1, 0.9, 20)]
+    nested = trimesh.util.concatenate(boxes)
+    still = sequences.Animation(
+        np.stack([nested.vertices] * 2).astype(np.float32),
+        nested.faces.astype(np.int32),
+    )
+    [mesh, _] = sequences.frames_of(still, 2, ground=False)
+    carried = sequences.carried_samples(mesh, 400, seed=0)
+    samples = sequences.samples_at(mesh, carried)
+    assert len(samples.position) == 400
+    np.testing.assert_allclose(np.abs(samples.position).max(axis=1), 0.5, atol=1e-5)
+
+
 frames = hnp.arrays(np.float32, (4, 6), elements=st.floats(0, 1, width=32))
 
 

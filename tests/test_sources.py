@@ -15,12 +15,12 @@ from ginn_jax.objects import (
     file_sources,
     load_light,
     origin_of,
-    pair_up,
     point_lights,
     procedural_lights,
     procedural_sources,
     random_point_light,
 )
+from ginn_jax.pairing import pair_up
 from ginn_jax.renderer import use_mitsuba
 
 

@@ -1,0 +1,87 @@
+"""Samples of a scene's surface where a camera can be: those that light can reach."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import TypeVar
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Int
+
+from ginn_jax.errors import InputError
+from ginn_jax.mesh import Mesh
+from ginn_jax.reference import Scene, ambient_occlusion
+from ginn_jax.samples import Samples, sample_surface
+
+Rows = TypeVar("Rows")
+FAR, PROBE_RAYS = 100.0, 32
+OBJECT = 0  # the material of what stands on the ground
+
+
+def visible_samples(
+    scene: Scene, count: int, seed: int, both_sides: bool = True
+) -> Samples:
+    """Uniform samples of the surface that light can reach, on both its sides.
+
+    Meshes of many parts hide surface inside other parts, where no camera can be; it
+    would only take points away from what is seen. A sample is dropped if none of
+    `PROBE_RAYS` rays from it leaves the scene. So the inside of what is closed is
+    dropped, and a sheet without thickness has samples with normals to either side, as
+    a camera sees it; unless `both_sides` is off. The ground has one side.
+
+    Raises:
+        InputError: a scene that is almost all sealed off.
+    """
+
+    def draw(drawn: int) -> tuple[Samples, Samples]:
+        samples = sample_sides(scene.mesh, drawn, seed, both_sides)
+        return samples, samples
+
+    return draw_reached(draw, scene, count, seed)
+
+
+def draw_reached(
+    draw: Callable[[int], tuple[Rows, Samples]], scene: Scene, count: int, seed: int
+) -> Rows:
+    """The first `count` rows of what is drawn whose samples light reaches.
+
+    `draw` is asked for more until there are enough.
+
+    Raises:
+        InputError: a scene that is almost all sealed off.
+    """
+    drawn = 5 * count // 2
+    for _ in range(5):
+        rows, samples = draw(drawn)
+        seen = reached_by_light(scene, samples, seed)
+        if len(seen) >= count:
+            return jax.tree.map(partial(np.take, indices=seen[:count], axis=0), rows)
+        drawn = 2 * drawn
+    raise InputError("nearly all of the mesh's surface is sealed inside it: mend it")
+
+
+def sample_sides(mesh: Mesh, count: int, seed: int, both_sides: bool) -> Samples:
+    """At most `count` uniform samples; the normals of the object's to either side."""
+    position, normal, material = sample_surface(mesh, count, seed=seed)
+    behind, kept = draw_sides(material, both_sides, seed)
+    normal = np.where(behind[:, None], -normal, normal)
+    return Samples(position[kept], normal[kept], material[kept])
+
+
+def draw_sides(
+    material: Int[np.ndarray, "N"], both_sides: bool, seed: int
+) -> tuple[Bool[np.ndarray, "N"], Bool[np.ndarray, "N"]]:
+    """Which samples are of the back of their face, and which to keep of all.
+
+    Half are of the back where both sides count, but what is under the ground is not.
+    """
+    drawn = np.random.default_rng((seed, 7)).random(len(material)) < 0.5
+    behind = drawn & both_sides
+    return behind, ~behind | (material == OBJECT)
+
+
+def reached_by_light(scene: Scene, samples: Samples, seed: int) -> Int[np.ndarray, "K"]:
+    """The samples from which at least one of `PROBE_RAYS` rays leaves the scene."""
+    ends = samples.position, samples.normal
+    sky = ambient_occlusion(scene, *ends, FAR, rays=PROBE_RAYS, seed=seed)
+    return np.flatnonzero(sky.mean > 0)
