@@ -54,7 +54,7 @@ def test_animation_tells_the_flicker_of_every_method(tmp_path, effect):
         reference=16,
         points=1500,
         draws=2,
-        disks=(0.75, 1.25),
+        disks=(0.75,),
     )
     metrics = animation.main(options)
     rows = {row["method"]: row for row in metrics["flicker"]}

@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+import tiny
 from hypothesis import given
 from hypothesis import strategies as st
 from oracles import neighbors
@@ -67,6 +68,12 @@ def test_lists_of_several_words_and_a_last_packet_that_is_not_full(crowd, packet
 @sizes
 def test_exact_limits_suffice_and_one_less_is_told(crowd, packet):
     points, queries = crowd
+    with tiny.cheap_compiling():
+        check_limits(points, queries, packet)
+
+
+def check_limits(points, queries, packet):
+    """Every limit at its demand, then each in turn at one less."""
     full, demand = pairs(points, queries, 0.3, packet)
     exact = pk.EdgeLimit(*(int(need) for need in demand))
     assert pairs(points, queries, 0.3, packet, exact) == (full, demand)
