@@ -121,6 +121,7 @@ def main(options: Options) -> dict[str, Any]:
         "flicker": pooled(list(found.values())),
         "sequences": found,
         "frames": {name: len(meshes) for name, meshes in scenes.items()},
+        "samples": settings.points,
         "options": {k: str(v) for k, v in asdict(options).items()},
         "environment": report.environment(),
     }

@@ -15,10 +15,11 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from ginn_jax import compare, compare_report, report
+from ginn_jax import compare, compare_figures, compare_report, report
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
 from ginn_jax.compare import Compared, Picture, Shot
+from ginn_jax.compare_light import counted_rows
 from ginn_jax.compare_networks import (
     NETWORKS,
     OURS,
@@ -85,6 +86,9 @@ class Options:
     64,000 for ambient occlusion, 32,000 for light."""
     looks: int = 512
     """Directions of the direct light per sample and pixel: what all are given."""
+    fewer_looks: tuple[int, ...] = (32, 128)
+    """So many directions instead, at which our network runs as well, what its light
+    takes counted in its time."""
     radius: float = 0.1
     """Occlusion radius."""
     seed: int = 0
@@ -94,7 +98,13 @@ class Options:
 
 
 QUICK = {"objects": 1, "views": 1, "resolution": 64, "reference": 16, "points": 4000}
-QUICK |= {"counts": (1, 4), "disks": (), "scales": (0.5,), "draws": 2}
+QUICK |= {
+    "counts": (1, 4),
+    "disks": (),
+    "scales": (0.5,),
+    "draws": 2,
+    "fewer_looks": (32,),
+}
 
 
 def main(options: Options) -> dict[str, Any]:
@@ -118,33 +128,26 @@ def main(options: Options) -> dict[str, Any]:
     clouds = make(console, "clouds", sources, settings, options.out / "clouds")
     at_points, networks = errors_at_points(networks, clouds, sources, settings)
     networks |= disk_variants(networks[OURS], options.disks)
-    rows, front_rows, shown, light = [], [], [], []
+    found = []
     for source, cloud in zip(sources, clouds, strict=True):
         console.print(f"{source.name}")
-        found, networks = compare_scene(options, settings, source, cloud, networks)
-        rows += found.rows
-        front_rows += found.front
-        shown.append((source.name, found.shown))
-        light.append(found.light)
+        scene, networks = compare_scene(options, settings, source, cloud, networks)
+        found.append(scene)
     memory = {
         name: network_memory(networks[name], count_given(settings.points))
         for name in NETWORKS
     }
     at_points = {n: r | {"memory_mib": memory[n]} for n, r in at_points.items()}
-    metrics = summary(options, at_points, rows, front_rows, [s.name for s in sources])
-    metrics["seconds_of_light"] = {
-        place: float(np.mean([row[place] for row in light])) for place in light[0]
-    }
-    compare_report.draw_methods(options.out / "ablation.png", shown[:4])
-    compare_report.draw_front(
-        options.out / "error_against_time.png", metrics["error_against_time"]
-    )
-    title = TITLES[options.effect]
-    report.write_results(
-        options.out, metrics, compare_report.write_report(title, metrics)
-    )
-    lost = len(metrics["lost_cells"])
-    console.print(f"{lost} cells lost: {options.out / 'report.md'}")
+    names = [source.name for source in sources]
+    metrics = summary(options, at_points, found, names)
+    shown = [(name, scene.shown) for name, scene in zip(names, found, strict=True)]
+    compare_figures.draw_methods(options.out / "ablation.png", shown[:4])
+    lines = metrics["error_against_time"], metrics["light_counted"]
+    compare_figures.draw_front(options.out / "error_against_time.png", *lines)
+    text = compare_report.write_report(TITLES[options.effect], metrics)
+    report.write_results(options.out, metrics, text)
+    lost = metrics["lost_cells"]
+    console.print(f"{len(lost)} cells lost: {options.out / 'report.md'}")
     return metrics
 
 
@@ -158,7 +161,7 @@ def compare_scene(
     """All methods on all views of a scene, and the networks with limits that do."""
     stage = compare.set_stage(source, settings)
     given, units = points_given(cloud)
-    rows, front, shown, light = [], [], {}, {}
+    rows, front, shown, counted = [], [], {}, []
     for view in range(options.views):
         azimuth = 35.0 + 360.0 * view / options.views
         size = options.resolution
@@ -178,14 +181,15 @@ def compare_scene(
         rows += [p.row | {"name": source.name, "view": view} for p in pictures]
         if view == 0:
             shown = compare.displayed(shot, pictures)
-            ends = stage, given, shot, settings
-            light = compare.seconds_of_light(*ends, seed=source.seed)
+            looks = options.looks, *options.fewer_looks
+            ends = stage, given, shot, networks[OURS], looks
+            counted, networks[OURS] = counted_rows(*ends, seed=source.seed)
             front += [p.row for p in pictures]
             own = next(p for p in pictures if p.row["method"] == OURS)
             front += rivals(options, settings, shot, given, own, networks, units)
             rates = {OURS + at_scale(scale) for scale in (1.0, *options.scales)}
             front += [codes_kept(row) for row in front if row["method"] in rates]
-    return Compared(rows, front, shown, light), networks
+    return Compared(rows, front, shown, counted), networks
 
 
 def rivals(
@@ -220,20 +224,21 @@ def rivals(
 def summary(
     options: Options,
     at_points: dict[str, Row],
-    rows: list[Row],
-    front_rows: list[Row],
+    found: list[Compared],
     names: list[str],
 ) -> dict[str, Any]:
     """What metrics.json holds."""
-    return compare_report.summary(options.effect, at_points, rows, front_rows) | {
-        "objects": len(names),
-        "names": names,
-        "rows": rows,
-        "front_rows": front_rows,
-        "options": {k: str(v) for k, v in asdict(options).items()},
-        "environment": report.environment(),
-        "peak_memory_gib": report.peak_memory_gib(),
+    tables = {
+        "rows": [row for scene in found for row in scene.rows],
+        "front_rows": [row for scene in found for row in scene.front],
+        "counted_rows": [row for scene in found for row in scene.counted],
     }
+    metrics = compare_report.summary(options.effect, at_points, *tables.values())
+    metrics |= tables
+    metrics |= {"objects": len(names), "names": names}
+    metrics |= {"options": {k: str(v) for k, v in asdict(options).items()}}
+    metrics |= {"environment": report.environment()}
+    return metrics | {"peak_memory_gib": report.peak_memory_gib()}
 
 
 if __name__ == "__main__":

@@ -76,12 +76,14 @@ Modules, in the order the data flows; each imports only what stands before it:
     pretrained        the trained networks that come with the package
     compare           shots, and the errors of the pictures that methods make of them
     compare_networks  the networks on a shot: their pictures and memory
+    compare_light     our network with what its direct light takes
     compare_frames    the networks on the frames of an animation
     compare_screen    methods of screen space on a shot
     compare_tracing   references of shots, and tracing as a rival
     report            metrics.json, report.md and figures of an experiment
     experiment        what every experiment does around its effect
-    compare_report    lost cells, Pareto front and figures of a comparison
+    compare_report    lost cells, Pareto front and report.md of a comparison
+    compare_figures   its figures
     sequences         animated meshes, samples that move with them, flicker
     animation_report  flicker, strip, moving image and report.md of animations
     occlusion_report  report.md of the experiment of ambient occlusion

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from ginn_jax import compare_report, report, sequences
+from ginn_jax import compare_figures, report, sequences
 from ginn_jax.metrics import tone_map
 
 KNOWN = "reference", "variance", "mask", "albedo"
@@ -56,7 +56,7 @@ def draw_frames(out: Path, frames: dict[str, np.ndarray]) -> None:
     seen = {name: frames[name] * albedo for name in names}
     reference = seen["reference"]
     whole = reference.reshape(-1, *reference.shape[2:])
-    foreground = compare_report.foreground(whole)
+    foreground = compare_figures.foreground(whole)
 
     def shown(images: np.ndarray) -> np.ndarray:
         flat = images.reshape(whole.shape)
@@ -81,7 +81,7 @@ def write_report(m: dict[str, Any]) -> str:
 
 {", ".join(f"{name} ({m['frames'][name]} frames)" for name in found)} at
 {options["resolution"]} x {options["resolution"]}, reference of {options["reference"]}
-rays or paths a pixel.
+rays or paths a pixel. Networks are given {m["samples"]} samples of a frame.
 {env["processor"]}, {env["cores"]} cores.
 
 Flicker is the mean squared change from frame to frame that the reference does not have,

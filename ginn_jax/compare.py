@@ -19,7 +19,7 @@ from ginn_jax.estimates import ColorEstimate
 from ginn_jax.evaluate import Row, View
 from ginn_jax.evaluate_light import LitView
 from ginn_jax.lighting import find_environments
-from ginn_jax.lit_scenes import Illumination, Lit, Scattering, light_up, lit_points
+from ginn_jax.lit_scenes import Illumination, Lit, Scattering, light_up
 from ginn_jax.mesh import Mesh, find_meshes
 from ginn_jax.metrics import relative_error
 from ginn_jax.objects import (
@@ -33,7 +33,6 @@ from ginn_jax.objects import (
 )
 from ginn_jax.pairing import pair_up, spread
 from ginn_jax.reference import Estimate
-from ginn_jax.samples import Samples
 from ginn_jax.scenes import Occlusion, Settings
 
 Shot = View | LitView
@@ -54,16 +53,16 @@ class Picture(NamedTuple):
 class Compared(NamedTuple):
     """What all methods made of a scene.
 
-    rows   the table, a row for each method and view
-    front  error against run time, in the first view
-    shown  the first view's pictures
-    light  seconds that its direct light took
+    rows     the table, a row for each method and view
+    front    error against run time, in the first view
+    shown    the first view's pictures
+    counted  ours by looks, its direct light counted in its time
     """
 
     rows: list[Row]
     front: list[Row]
     shown: dict[str, np.ndarray]
-    light: Row
+    counted: list[Row]
 
 
 def unseen_sources(
@@ -103,25 +102,6 @@ def take_shot(stage: Stage, camera: Camera, settings: Settings, *, seed: int) ->
         return evaluate.frame(stage, camera)
     assert not isinstance(settings, Occlusion)
     return evaluate_light.lit_frame(stage, camera, settings, seed=seed)
-
-
-def seconds_of_light(
-    stage: Stage, cloud: Any, shot: Shot, settings: Settings, *, seed: int
-) -> Row:
-    """What it takes to find the direct light that networks are given, by its place.
-
-    Of the samples of the cloud and of the pixels; nothing without light.
-    """
-    if isinstance(settings, Occlusion):
-        return {}
-    assert not isinstance(stage, Mesh)
-    assert isinstance(shot, LitView)
-    seconds = {}
-    for place, points in (("samples", cloud), ("pixels", shot.pixels)):
-        there = Samples(points.position, points.normal, points.material)
-        look = partial(lit_points, stage, there, settings.looks, seed=seed)
-        _, _, seconds[place] = evaluate.timed(look, repeats=1)
-    return seconds
 
 
 def with_truth(shot: Shot, truth: Truth) -> Shot:

@@ -1,18 +1,14 @@
-"""What a comparison of methods comes to: lost cells, Pareto front, report, figures."""
+"""What a comparison of methods comes to: lost cells, Pareto front, report."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
 from ginn_jax import report
 from ginn_jax.compare_networks import OURS
 from ginn_jax.evaluate import Row
-from ginn_jax.metrics import relative_error, tone_map
+from ginn_jax.metrics import relative_error
 
 RIVALS = ("screen space", "visibility bitmask", "2D only", "3D only")
 CELLS = ("mse_3d", "mse_2d", "dssim_2d")
@@ -64,6 +60,7 @@ def summary(
     at_points: Mapping[str, Row],
     rows: Sequence[Row],
     front_rows: Sequence[Row],
+    counted_rows: Sequence[Row] = (),
 ) -> dict[str, Any]:
     """What all shots together say of the methods, and the errors at points."""
     results = pool_shots(rows)
@@ -72,15 +69,19 @@ def summary(
         row |= {k: known[k] for k in KEPT if k in known}
     front = pool_shots(front_rows)
     fresh = [row for row in front if "kept" not in row]
+    counted = pool_shots(counted_rows)
+    traced = [row for row in front if "traced" in row or "denoised" in row]
     ours = next(r for r in results if r["method"] == OURS)
     openness = "Errors are of openness, 1 where nothing is near."
     return {
         "results": results,
         "lost_cells": lost_cells(results),
         "error_against_time": front,
+        "light_counted": counted,
         "front_mse": pareto_front(fresh),
         "front_dssim": pareto_front(fresh, "dssim_2d"),
         "front_kept": pareto_front(front),
+        "front_counted": pareto_front([*counted, *traced]),
         "share_2d": ours["seconds_2d"] / ours["seconds"],
         "denoiser": any("denoised" in row for row in front),
         "units": openness if effect == "ao" else UNITS,
@@ -127,7 +128,6 @@ Memory is what the compiled functions ask for beside their inputs and outputs.
 
 {report.table_of(m["results"], times)}
 f_2D takes {m["share_2d"]:.0%} of our network's time (paper: 60 %).
-{_of_light(m["seconds_of_light"], options["looks"])}
 
 ## Error against run time
 
@@ -139,99 +139,31 @@ Pareto front by 2D MSE: {", ".join(m["front_mse"])}.
 By DSSIM: {", ".join(m["front_dssim"])}. By 2D MSE where codes
 are kept: {", ".join(m["front_kept"])}.
 
+{_of_light(m)}
 ![error against run time](error_against_time.png)
 
 ![methods on the same pixels](ablation.png)
 """
 
 
-def _of_light(seconds: Mapping[str, float], looks: Any) -> str:
-    """What the times leave out of what networks are given."""
-    if not seconds:
+def _of_light(m: Mapping[str, Any]) -> str:
+    """Our network with what its direct light takes, which is in no other time."""
+    if not m["light_counted"]:
         return ""
-    return f"""
-The direct light that networks are given is not in their times, nor in those of what
-they are compared with below: at {looks} looks a point it takes {seconds["samples"]:.3g}
-s more for the samples of a scene and {seconds["pixels"]:.3g} s for the pixels of a
-view. Tracing needs none of the former, and of scattering none of the latter."""
+    columns = {"method": "method", "seconds_samples": "light of samples s"}
+    columns |= {"seconds_pixels": "of pixels s", "seconds_network": "network s"}
+    columns |= {"seconds": "total s", "mse_2d": "2D MSE", "dssim_2d": "2D DSSIM"}
+    traced = [row for row in m["error_against_time"] if "traced" in row]
+    rows = report.beside_tracing([*m["light_counted"], *traced], "traced")
+    rows = rows[: len(m["light_counted"])]
+    return f"""## With direct light counted
 
+The networks are given direct light, which is in none of the times above. Here it is, at
+fewer looks a point as well, with the error that then is left. Light of pixels counts
+where the network asks for it; else it is the display alone that needs it, with tracing
+as well.
 
-def draw_front(path: Path, rows: list[Row]) -> None:
-    """Error against run time, one line a kind of method."""
-    mine = [r for r in rows if r["method"].startswith(OURS)]
-    fresh = [r for r in mine if "kept" not in r]
-    rates = [r for r in fresh if "scale" in r["method"]]
-    means = [r for r in fresh if "mean" in r["method"]]
-    groups = {
-        OURS: [r for r in fresh if r not in rates + means],
-        f"{OURS}, fewer pixels": rates,
-        f"{OURS}, mean of draws": means,
-        f"{OURS}, codes kept": [r for r in mine if "kept" in r],
-        "ablations": [r for r in rows if r["method"] in ("2D only", "3D only")],
-        "screen space": [
-            r for r in rows if r["method"] in ("screen space", "visibility bitmask")
-        ],
-        "traced": [r for r in rows if "traced" in r],
-        "traced and denoised": [r for r in rows if "denoised" in r],
-    }
-    kept = {n: [_short(r) for r in group] for n, group in groups.items() if group}
-    report.draw_error_against_time(path, kept)
-
-
-def _short(row: Row) -> Row:
-    """A row whose label leaves out what its line in the figure says."""
-    name = row["method"].removesuffix(", denoised").removesuffix(", codes kept")
-    name = name.removeprefix(f"{OURS}, ")
-    return row | {"method": name}
-
-
-def draw_methods(
-    path: Path,
-    shots: Sequence[tuple[str, Mapping[str, Float[np.ndarray, "H W *C"]]]],
-) -> None:
-    """A row a shot, a column a method, "reference" too, each with an enlarged inset."""
-    names = list(shots[0][1])
-    figure = Figure(figsize=(2.6 * len(names), 2.8 * len(shots)), layout="constrained")
-    grid = np.atleast_2d(figure.subplots(len(shots), len(names), squeeze=False))
-    for line, (title, pictures) in zip(grid, shots, strict=True):
-        right = pictures["reference"]
-        corner, size = inset_place(right)
-        for axes, name in zip(line, names, strict=True):
-            shown = tone_map(pictures[name], right, foreground(right))
-            axes.imshow(shown, cmap="gray", vmin=0, vmax=1)
-            axes.set_title(f"{title}\n{name}" if name == names[0] else name, fontsize=8)
-            axes.axis("off")
-            _inset(axes, shown, corner, size)
-    figure.savefig(path, dpi=110)
-
-
-def foreground(image: Float[np.ndarray, "H W *C"]) -> np.ndarray:
-    """Pixels that hold something in a reference."""
-    return (image.sum(-1) if image.ndim == 3 else image) > 0
-
-
-def inset_place(image: Float[np.ndarray, "H W *C"]) -> tuple[tuple[int, int], int]:
-    """The square, a fifth of the image, in which the reference varies most."""
-    gray = image.mean(-1) if image.ndim == 3 else image
-    size = max(min(gray.shape) // 5, 4)
-    tiles = [
-        (float(np.std(np.sqrt(np.maximum(gray[i : i + size, j : j + size], 0)))), i, j)
-        for i in range(size, gray.shape[0] - 2 * size + 1, size // 2)
-        for j in range(size, gray.shape[1] - 2 * size + 1, size // 2)
-        if foreground(image[i : i + size, j : j + size]).all()
-    ]
-    _, row, column = max(tiles, default=(0.0, 2 * size, 2 * size))
-    return (row, column), size
-
-
-def _inset(axes: Any, image: np.ndarray, corner: tuple[int, int], size: int) -> None:
-    row, column = corner
-    square = image[row : row + size, column : column + size]
-    small = axes.inset_axes((0.62, 0.0, 0.38, 0.38))
-    small.imshow(square, cmap="gray", vmin=0, vmax=1)
-    small.set(xticks=[], yticks=[])
-    for frame in small.spines.values():
-        frame.set_color("tab:red")
-    axes.add_patch(
-        Rectangle((column, row), size, size, fill=False, edgecolor="tab:red")
-    )
+{report.table_of(rows, columns | report.TRACING)}
+Pareto front of these and tracing, plain and denoised, by 2D MSE:
+{", ".join(m["front_counted"])}.
+"""

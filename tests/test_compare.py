@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from experiments import evaluate as experiment
 from ginn_jax import blocks, checkpoint, report, run_record, scenes
+from ginn_jax.compare_figures import inset_place
 from ginn_jax.compare_networks import OURS, redrawn
 from ginn_jax.compare_report import (
     RIVALS,
-    inset_place,
     lost_cells,
     pareto_front,
     pool_shots,
@@ -153,6 +153,8 @@ def test_light_is_compared_with_tracing_plain_and_denoised(tmp_path, monkeypatch
         disks=(0.75,),
         draws=2,
         points=1500,
+        looks=16,
+        fewer_looks=(4,),
     )
     found = experiment.main(options)
     rows = {row["method"]: row for row in found["error_against_time"]}
@@ -165,6 +167,16 @@ def test_light_is_compared_with_tracing_plain_and_denoised(tmp_path, monkeypatch
     assert denoised["mse_2d"] == pytest.approx(plain["mse_2d"], rel=1e-5)
     assert denoised["seconds"] > plain["seconds"]
     assert asked[0] == (*[(40, 40, 3)] * 3, True, True)
+    counted = {row["looks"]: row for row in found["light_counted"]}
+    assert set(counted) == {16, 4}
+    assert counted[16]["mse_2d"] == pytest.approx(rows[OURS]["mse_2d"], rel=1e-3)
+    assert counted[4]["mse_2d"] != counted[16]["mse_2d"]
+    for row in counted.values():
+        parts = [row[f"seconds_{part}"] for part in ("network", "samples", "pixels")]
+        assert min(parts) > 0
+        assert row["seconds"] == pytest.approx(sum(parts))
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert "With direct light counted" in text
     results = {row["method"]: row for row in found["results"]}
     for name in (OURS, "2D only", "3D only"):
         assert results[name]["relative_mse_3d"] > 0
@@ -196,6 +208,7 @@ def test_comparison_ends_in_a_report_and_keeps_its_references(tmp_path):
     text = (tmp_path / "out" / "report.md").read_text()
     assert all(name in text for name in (*names, "rays of equal MSE"))
     errors = {row["method"]: row["mse_2d"] for row in first["results"]}
+    assert "direct light counted" not in text
     lost = [line for line in first["lost_cells"] if "mse_2d: screen space" in line]
     assert bool(lost) == (errors["screen space"] < errors[OURS])
     assert all(line in text for line in first["lost_cells"])
