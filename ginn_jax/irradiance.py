@@ -152,12 +152,30 @@ def _direct(
         square = mi.Point2f(*square)
         receiver = dr.zeros(mi.SurfaceInteraction3f, len(points) * samples)
         receiver.p, receiver.n = at, normal
-        toward, radiance = scene.handle.sample_emitter_direction(receiver, square)
-        cosine = dr.fmax(dr.dot(toward.d, normal), 0)
-        arrived = dr.select(toward.pdf > 0, radiance * cosine, 0)
-        dr.eval(arrived)
+        toward, radiance = scene.handle.sample_emitter_direction(
+            receiver, square, test_visibility=False
+        )
+        cosine = dr.dot(toward.d, normal)
+        above = (toward.pdf > 0) & (cosine > 0)
+        cast = receiver.spawn_ray_to(toward.p)
+        arrived = dr.select(above, radiance * cosine, 0)
+        dr.eval(arrived, above, cast)
+        arrived *= dr.select(_free(scene, cast, above), 1, 0)
         total = [dr.block_reduce(dr.ReduceOp.Add, c, samples) for c in arrived]
         return np.stack([c.numpy() for c in total], axis=1) / samples
+
+
+def _free(scene: LitScene, cast: Any, asked: Any) -> Any:
+    """Whether asked rays meet nothing; they are packed, so that others cost nothing."""
+    mi, _ = use_mitsuba()
+    import drjit as dr
+
+    rows: Any = dr.compress(asked)
+    free = asked & False
+    if len(rows):
+        blocked = scene.handle.ray_test(dr.gather(mi.Ray3f, cast, rows))
+        dr.scatter(free, ~blocked, rows)
+    return free
 
 
 def indirect_irradiance(
