@@ -181,7 +181,7 @@ def compare_scene(
         rows += [p.row | {"name": source.name, "view": view} for p in pictures]
         if view == 0:
             shown = compare.displayed(shot, pictures)
-            looks = options.looks, *options.fewer_looks
+            looks = sorted({options.looks, *options.fewer_looks})
             ends = stage, given, shot, networks[OURS], looks
             counted, networks[OURS] = counted_rows(*ends, seed=source.seed)
             front += [p.row for p in pictures]
