@@ -23,7 +23,7 @@ from benchmarks.timing import Timing, circumstances, describe, measure
 from ginn_jax import blocks, image, inference, objects, reference, report
 from ginn_jax.architecture import Network
 from ginn_jax.camera import orbit_camera
-from ginn_jax.commandline import require, start
+from ginn_jax.commandline import require, require_positive, start
 from ginn_jax.evaluate import at_scale
 from ginn_jax.limits import Limits, only
 from ginn_jax.mesh import find_meshes
@@ -180,7 +180,10 @@ def block_memory(
 
 def main(options: Options) -> dict[str, Any]:
     """Compare every network on one frame; returns what metrics.json holds."""
-    require(options, {"resolution": 32, "points": 500, "repeats": 1, "hidden": 1})
+    least = {"resolution": 32, "points": 500, "repeats": 1, "hidden": 1, "rays": 1}
+    require(options, least)
+    require_positive(options, "disks")
+    require_positive(options, "radii")
     begin = time.perf_counter()
     scene, gbuffer = make_frame(options)
     pairs = zip(options.disks, options.radii, strict=True)

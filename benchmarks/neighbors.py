@@ -19,8 +19,7 @@ from matplotlib.figure import Figure
 from benchmarks.peers import PEERS, Pairs, Search
 from benchmarks.timing import Timing, circumstances, describe, measure
 from ginn_jax import objects, report
-from ginn_jax.commandline import require, start
-from ginn_jax.errors import InputError
+from ginn_jax.commandline import require, require_positive, start
 from ginn_jax.neighbors import find_neighbors
 from ginn_jax.samples import sample_surface
 
@@ -129,9 +128,8 @@ def best_ratio(timings: dict[str, Timing]) -> float:
 
 def main(options: Options) -> dict[str, Any]:
     """Compare on every cloud and radius; returns what metrics.json holds."""
-    require(options, {"points": 1, "repeats": 1, "seed": 0})
-    if not all(0 < radius < np.inf for radius in options.radii):
-        raise InputError(f"--radii {options.radii}: give numbers above 0")
+    require(options, {"points": 1, "queries": 1, "repeats": 1, "seed": 0})
+    require_positive(options, "radii")
     begin = time.perf_counter()
     cases = [
         compare(options, c, r, n)

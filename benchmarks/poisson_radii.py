@@ -79,6 +79,7 @@ def main(options: Options) -> dict[str, Any]:
     least = {"objects": 1, "points": 1000, "resolution": 32, "reference": 2}
     require(options, least | {"looks": 1, "rounds": 1})
     require_positive(options, "radius")
+    require_positive(options, "times")
     if not options.times:
         raise InputError("--times is empty: give at least one")
     begin = time.perf_counter()

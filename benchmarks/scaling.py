@@ -120,7 +120,7 @@ def slope(rows: list[dict[str, Any]]) -> float:
 
 def main(options: Options) -> dict[str, Any]:
     """Time all sizes and fit; returns what metrics.json holds."""
-    require(options, {"repeats": 1})
+    require(options, {"repeats": 1, "points": 100, "resolutions": 32})
     begin = time.perf_counter()
     scene = reference.build_scene(
         objects.load_object(objects.procedural_sources(1, UNSEEN_SEED)[0])

@@ -24,7 +24,7 @@ from ginn_jax.animation_report import (
     write_report,
 )
 from ginn_jax.camera import orbit_camera
-from ginn_jax.commandline import require, start
+from ginn_jax.commandline import require, require_positive, start
 from ginn_jax.compare import Stage
 from ginn_jax.compare_frames import Playing, shade_next, start_playing
 from ginn_jax.compare_networks import OURS, Trained, disk_variants, load_networks
@@ -92,6 +92,7 @@ def main(options: Options) -> dict[str, Any]:
     """Shade all frames; returns what metrics.json holds."""
     least = {"frames": 2, "resolution": 32, "reference": 2, "points": 1000, "looks": 1}
     require(options, least | {"seed": 0, "draws": 2})
+    require_positive(options, "disks")
     console = Console()
     counts = options.points, options.reference
     settings = compare.effect_settings(options.effect, *counts, options.radius)

@@ -108,22 +108,33 @@ def hasten(options: Any, quick: Mapping[str, Any]) -> Any:
 
 
 def require_positive(options: Any, name: str) -> None:
-    """Raise `InputError` for an option that is not a finite number above 0."""
-    value = getattr(options, name)
-    if not 0 < value < float("inf"):
-        raise InputError(f"--{name.replace('_', '-')} is {value}: give it above 0")
+    """Raise `InputError` for an option that is not a finite number above 0.
+
+    Of an option of several values, for the first of them.
+    """
+    for value in _values(options, name):
+        if not 0 < value < float("inf"):
+            raise InputError(f"--{name.replace('_', '-')} is {value}: give it above 0")
 
 
 def require(options: Any, least: Mapping[str, int]) -> None:
     """Raise `InputError` for the first option below its least value, or beyond all.
 
-    An option left out, None, has its value chosen by the script.
+    An option left out, None, has its value chosen by the script; of several values each
+    is looked at.
     """
     for name, minimum in least.items():
-        flag, value = name.replace("_", "-"), getattr(options, name)
-        if value is None:
-            continue
-        if value < minimum:
-            raise InputError(f"--{flag} is {value}: give at least {minimum}")
-        if value > LARGEST_INDEX:
-            raise InputError(f"--{flag} is {value}: give at most {LARGEST_INDEX}")
+        flag = name.replace("_", "-")
+        for value in _values(options, name):
+            if value < minimum:
+                raise InputError(f"--{flag} is {value}: give at least {minimum}")
+            if value > LARGEST_INDEX:
+                raise InputError(f"--{flag} is {value}: give at most {LARGEST_INDEX}")
+
+
+def _values(options: Any, name: str) -> tuple[Any, ...]:
+    """The values of an option: several, one, or none where it is left out."""
+    value = getattr(options, name)
+    if isinstance(value, tuple):
+        return value
+    return () if value is None else (value,)

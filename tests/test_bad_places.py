@@ -20,7 +20,8 @@ import trimesh
 from damaged import contents, refused
 from saved import STATE, restore, save_state
 
-from experiments import ao_train, gi_train
+from benchmarks import neighbors, scaling
+from experiments import animation, ao_train, evaluate, gi_train
 from ginn_jax import (
     checkpoint,
     commandline,
@@ -232,6 +233,27 @@ def test_mistakes_in_options_end_in_code_2(
     code, line = ends(monkeypatch, capsys, script, *words)
     assert code == 2
     assert re.search(message, line)
+    assert not contents(tmp_path)
+
+
+SEVERAL = [
+    (evaluate, ("--counts", "4", "0"), "--counts is 0: give at least 1"),
+    (evaluate, ("--fewer-looks", "0"), "--fewer-looks is 0: give at least 1"),
+    (evaluate, ("--disks", "1.5", "inf"), "--disks is inf: give it above 0"),
+    (animation, ("--disks", "-1"), "--disks is -1.0: give it above 0"),
+    (neighbors, ("--radii", ".1", "0"), "--radii is 0.0: give it above 0"),
+    (scaling, ("--points", "1000", "-4"), "--points is -4: give at least 100"),
+]
+
+
+@pytest.mark.parametrize(("script", "words", "message"), SEVERAL)
+def test_each_of_several_values_is_looked_at(
+    script, words, message, tmp_path, monkeypatch, capsys
+):
+    words = ("--out", tmp_path / "out", *words)
+    code, line = ends(monkeypatch, capsys, script, *words)
+    assert code == 2
+    assert message in line
     assert not contents(tmp_path)
 
 
