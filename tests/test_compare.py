@@ -151,6 +151,7 @@ def test_light_is_compared_with_tracing_plain_and_denoised(tmp_path, monkeypatch
         reference=8,
         counts=(2,),
         disks=(0.75,),
+        scales=(0.5,),
         draws=2,
         points=1500,
         looks=16,
@@ -198,6 +199,7 @@ def test_comparison_ends_in_a_report_and_keeps_its_references(tmp_path):
         reference=16,
         counts=(1, 4),
         disks=(),
+        scales=(0.5,),
         points=2000,
     )
     first = experiment.main(options)

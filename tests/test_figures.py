@@ -44,8 +44,8 @@ def tiny_networks(monkeypatch):
         monkeypatch.setattr(module, "load_network", load)
 
 
-@pytest.mark.parametrize("effect", ["ao", "sss"])
-def test_animation_tells_the_flicker_of_every_method(tmp_path, effect):
+@pytest.mark.parametrize(("effect", "disks"), [("ao", (0.75,)), ("sss", ())])
+def test_animation_tells_the_flicker_of_every_method(tmp_path, effect, disks):
     options = animation.Options(
         effect,
         tmp_path,
@@ -54,7 +54,7 @@ def test_animation_tells_the_flicker_of_every_method(tmp_path, effect):
         reference=16,
         points=1500,
         draws=2,
-        disks=(0.75,),
+        disks=disks,
     )
     metrics = animation.main(options)
     rows = {row["method"]: row for row in metrics["flicker"]}
