@@ -82,7 +82,8 @@ def equal_tracing(
     """What ray tracing comes to beside a method of this MSE and time.
 
     `traced` are the count of rays or paths a pixel, MSE and time of two runs at least.
-    An MSE is taken to fall as 1 / count, from the smallest, and times to be a line.
+    An MSE is taken to fall as 1 / count, from the smallest, and times to be a line, a
+    flat one where what is measured does not grow.
 
     Returns the count and the time at equal MSE, and the ratio of the MSEs, tracing over
     the method's, at equal time, or at one ray where there is time for less.
@@ -92,6 +93,8 @@ def equal_tracing(
     counts, errors, times = np.array(sorted(traced), np.float64).T
     single = float(errors[0] * counts[0])
     slope, start = np.polyfit(counts, times, 1)
+    if slope <= 0:
+        slope, start = 0.0, times.mean()
     affordable = max((seconds - start) / slope, 1.0) if slope > 0 else 1.0
     equal = single / error
     return equal, float(start + slope * equal), float(single / affordable / error)
