@@ -15,7 +15,7 @@ from ginn_jax.evaluate import Row
 from ginn_jax.metrics import tone_map
 
 
-def draw_front(path: Path, rows: list[Row], counted: Sequence[Row] = ()) -> None:
+def draw_front(path: Path, rows: list[Row], counted: Sequence[Row]) -> None:
     """Error against run time, one line a kind of method."""
     mine = [r for r in rows if r["method"].startswith(OURS)]
     fresh = [r for r in mine if "kept" not in r]

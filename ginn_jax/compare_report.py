@@ -60,7 +60,7 @@ def summary(
     at_points: Mapping[str, Row],
     rows: Sequence[Row],
     front_rows: Sequence[Row],
-    counted_rows: Sequence[Row] = (),
+    counted_rows: Sequence[Row],
 ) -> dict[str, Any]:
     """What all shots together say of the methods, and the errors at points."""
     results = pool_shots(rows)

@@ -59,7 +59,7 @@ def test_help_names_every_option():
 
 
 def test_mistakes_end_in_one_line_and_code_2(tmp_path):
-    """Those of every other kind do so in `test_bad_places`, in this process."""
+    """Those of every other kind do so in `test_bad_scripts`, in this process."""
     words = "--out", str(tmp_path), "--test-meshes", "no/such/folder"
     said = command(*words)
     assert said.returncode == 2
