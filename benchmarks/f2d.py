@@ -182,8 +182,7 @@ def main(options: Options) -> dict[str, Any]:
     """Compare every network on one frame; returns what metrics.json holds."""
     least = {"resolution": 32, "points": 500, "repeats": 1, "hidden": 1, "rays": 1}
     require(options, least)
-    require_positive(options, "disks")
-    require_positive(options, "radii")
+    require_positive(options, "disks", "radii")
     begin = time.perf_counter()
     scene, gbuffer = make_frame(options)
     pairs = zip(options.disks, options.radii, strict=True)

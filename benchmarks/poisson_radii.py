@@ -78,8 +78,7 @@ def main(options: Options) -> dict[str, Any]:
     """Compare radii on every object; returns what metrics.json holds."""
     least = {"objects": 1, "points": 1000, "resolution": 32, "reference": 2}
     require(options, least | {"looks": 1, "rounds": 1})
-    require_positive(options, "radius")
-    require_positive(options, "times")
+    require_positive(options, "radius", "times")
     if not options.times:
         raise InputError("--times is empty: give at least one")
     begin = time.perf_counter()

@@ -16,21 +16,18 @@ import jax
 import numpy as np
 
 from benchmarks.timing import Timing, circumstances, describe, measure
-from ginn_jax import inference, objects, presets, reference, report
+from ginn_jax import inference, objects, reference, report
 from ginn_jax.architecture import Network
 from ginn_jax.camera import orbit_camera
-from ginn_jax.checkpoint import load_weights
 from ginn_jax.commandline import require, start
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model
 from ginn_jax.evaluate_light import encode_lit
 from ginn_jax.limits import Limits
 from ginn_jax.lit_clouds import LitCloud, network_numbers
-from ginn_jax.recipe import Training
+from ginn_jax.pretrained import load_any
 from ginn_jax.relight import prepare_relighting, relight
 from ginn_jax.samples import Samples
-from ginn_jax.searches import uniform_limits
-from ginn_jax.train import init_state
 from ginn_jax.visible import visible_samples
 
 UNSEEN_SEED = 20_000_000
@@ -48,33 +45,13 @@ class Options:
     """Points of the cloud."""
     repeats: int = 7
     """Timed calls of each."""
-    run: Path | None = None
-    """A finished run of gi_train or sss_train, to take its network and limits from."""
-    networks: tuple[str, ...] = (
-        "illumination, homogeneous",
-        "illumination, linear",
-        "scattering, homogeneous",
-        "scattering, linear",
-    )
-    """Which networks."""
+    networks: tuple[str, ...] = ("gi", "sss")
+    """Trained networks that take light: folders of runs, or names as "gi"."""
     quick: bool = False
     """A small frame, few calls: to try things, not for numbers."""
 
 
-QUICK = {
-    "resolution": 64,
-    "points": 4000,
-    "repeats": 2,
-    "networks": ("illumination, homogeneous",),
-}
-NETWORKS = {
-    f"{effect}, {kind}": table[kind]
-    for effect, table in (
-        ("illumination", presets.ILLUMINATION),
-        ("scattering", presets.SCATTERING),
-    )
-    for kind in ("homogeneous", "linear")
-}
+QUICK = {"resolution": 64, "points": 4000, "repeats": 2, "networks": ("gi",)}
 
 
 def lit_pair(options: Options, network: Network) -> tuple[LitCloud, LitCloud]:
@@ -101,11 +78,13 @@ def in_random_light(samples: Samples, medium: np.ndarray, seed: int) -> LitCloud
     return LitCloud(position, normal, material, light, light, light, albedo, medium)
 
 
-def compare(options: Options, network: Network, limits: Limits) -> dict[str, Any]:
+def compare(options: Options, name: str) -> dict[str, Any]:
     """Times of one network: from scratch, relit, and in grey light."""
+    config, limits, variables = load_any(name)
+    network = config.network
+    if not network.lights:
+        raise InputError(f"{name} takes no light: name one of gi or of sss")
     cloud, pixels = lit_pair(options, network)
-    state = init_state(Training(network, steps=1))
-    variables = jax.device_put(state.variables, jax.devices()[0])
     model = Model(variables, jax.random.key(0))
     scratch, limits = from_scratch(network, limits, model, cloud, pixels)
     grey = [
@@ -126,6 +105,7 @@ def compare(options: Options, network: Network, limits: Limits) -> dict[str, Any
     difference = np.abs(calls["relit"]() - np.maximum(scratch(), 0.0)).max()
     times = measure(calls, options.repeats)
     return row_of(times) | {
+        "network": name,
         "pixels": len(pixels.position),
         "kept_mib": sum(a.nbytes for a in jax.tree.leaves(ready)) / 2**20,
         "largest_difference": float(difference),
@@ -153,11 +133,6 @@ def from_scratch(
     return lambda: shade(limits)[0], limits
 
 
-def small_limits(network: Network) -> Limits:
-    """Limits that have to be raised, so that they end up close to the need."""
-    return uniform_limits(network, 1 << 12)
-
-
 def row_of(times: dict[str, Timing]) -> dict[str, Any]:
     """Medians in ms, and what relighting and grey light save."""
     scratch, relit, grey = (t.median for t in times.values())
@@ -173,14 +148,10 @@ def row_of(times: dict[str, Timing]) -> dict[str, Any]:
 def main(options: Options) -> dict[str, Any]:
     """Time all networks; returns what metrics.json holds."""
     require(options, {"resolution": 16, "points": 1000, "repeats": 1})
+    if not options.networks:
+        raise InputError("--networks is empty: name at least one")
     begin = time.perf_counter()
-    if unknown := set(options.networks) - set(NETWORKS):
-        raise InputError(f"no network {unknown.pop()!r}: there are {list(NETWORKS)}")
-    cases = {n: (NETWORKS[n], small_limits(NETWORKS[n])) for n in options.networks}
-    if options.run is not None:
-        config, limits, _ = load_weights(options.run)
-        cases = {"of the run": (config.network, limits)}
-    rows = [{"network": n} | compare(options, *case) for n, case in cases.items()]
+    rows = [compare(options, name) for name in options.networks]
     metrics = {"rows": rows} | circumstances(options, begin)
     heads = {"network": "network", "pixels": "pixels", "scratch_ms": "from scratch ms"}
     heads |= {"relit_ms": "relit ms", "saving": "saving", "grey_ms": "grey ms"}

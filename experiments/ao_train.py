@@ -24,6 +24,7 @@ from ginn_jax.experiment import (
     RunOptions,
     check_run,
     closing,
+    errors_by_set,
     make,
     train,
     training,
@@ -144,10 +145,7 @@ def evaluation(
     )
     procedural = [r for r, s in zip(rows, sources, strict=True) if s.path is None]
     files = [r for r, s in zip(rows, sources, strict=True) if s.path is not None]
-    metrics = evaluate.pool_rows(procedural) | {"unseen_shapes": procedural}
-    if files:
-        metrics |= {"unseen_meshes_pooled": evaluate.pool_rows(files)}
-        metrics |= {"unseen_meshes": files}
+    sets = {"shapes": procedural} | ({"meshes": files} if files else {})
     floor = float(np.mean([np.mean(c.variance) for c in clouds]))
     report.draw_curve(options.out / "learning_curve.png", run.losses, floor)
     shown = list(zip(sources, unseen, strict=True))[:3]
@@ -156,7 +154,8 @@ def evaluation(
             *shown[:2],
             *list(zip(sources, unseen, strict=True))[len(procedural) :][:2],
         ]
-    return metrics | image_evaluation(options, config, limits, model, shown)
+    images = image_evaluation(options, config, limits, model, shown)
+    return errors_by_set(sets) | images
 
 
 def image_evaluation(

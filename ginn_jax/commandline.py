@@ -107,14 +107,16 @@ def hasten(options: Any, quick: Mapping[str, Any]) -> Any:
     return replace(options, **left)
 
 
-def require_positive(options: Any, name: str) -> None:
-    """Raise `InputError` for an option that is not a finite number above 0.
+def require_positive(options: Any, *names: str) -> None:
+    """Raise `InputError` for the first option that is not a finite number above 0.
 
-    Of an option of several values, for the first of them.
+    Of an option of several values each is looked at.
     """
-    for value in _values(options, name):
-        if not 0 < value < float("inf"):
-            raise InputError(f"--{name.replace('_', '-')} is {value}: give it above 0")
+    for name in names:
+        flag = name.replace("_", "-")
+        for value in _values(options, name):
+            if not 0 < value < float("inf"):
+                raise InputError(f"--{flag} is {value}: give it above 0")
 
 
 def require(options: Any, least: Mapping[str, int]) -> None:

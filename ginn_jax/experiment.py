@@ -21,6 +21,7 @@ from ginn_jax.checks import positive
 from ginn_jax.commandline import require, require_positive
 from ginn_jax.dataset import count_asked, count_given
 from ginn_jax.errors import InputError
+from ginn_jax.evaluate import Row, pool_rows
 from ginn_jax.lit_clouds import Cloud
 from ginn_jax.objects import SEEDS_APART, UNSEEN_SEED, Source
 from ginn_jax.pretrained import load_any, starting_weights
@@ -176,6 +177,16 @@ def training(
         epoch_steps=max(clouds // options.batch, 1),
         seed=options.seed,
     )
+
+
+def errors_by_set(sets: dict[str, list[Row]]) -> dict[str, Any]:
+    """What metrics.json says of the errors at the points of unseen clouds.
+
+    Pooled and of each, by the name of the set; those of the first set are the run's.
+    """
+    pooled = {f"unseen {name}": pool_rows(rows) for name, rows in sets.items()}
+    each = {f"unseen {name}, each": rows for name, rows in sets.items()}
+    return next(iter(pooled.values())) | pooled | each
 
 
 def closing(

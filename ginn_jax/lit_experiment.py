@@ -12,11 +12,12 @@ from rich.console import Console
 from ginn_jax import evaluate_light, fit, report
 from ginn_jax.architecture import Network
 from ginn_jax.dataset import count_asked, count_given
-from ginn_jax.evaluate import Model, fill, mean_rows, pool_rows
+from ginn_jax.evaluate import Model, fill, mean_rows
 from ginn_jax.experiment import (
     Clock,
     check_run,
     closing,
+    errors_by_set,
     make,
     train,
     training,
@@ -93,20 +94,18 @@ def evaluation(
     """All errors of the trained network; draws the figures."""
     variables = jax.device_put(run.state.variables, jax.devices()[0])
     model = Model(variables, jax.random.key(options.seed))
-    limits, metrics, each = run.limits, {}, []
+    limits, found = run.limits, {}
     for name, sources in unseen.items():
         names = [source.name for source in sources]
-        rows, limits = evaluate_light.evaluate_lit_clouds(
+        found[name], limits = evaluate_light.evaluate_lit_clouds(
             config.network, limits, model, clouds[name], names, settings
         )
-        pooled = pool_rows(rows)
-        metrics |= {f"unseen {name}": pooled, f"unseen {name}, each": rows}
-        each += rows
-    metrics |= halves_by_medium(each)
+    each = [row for rows in found.values() for row in rows]
+    metrics = errors_by_set(found) | halves_by_medium(each)
     firsts = (list(zip(unseen[n], clouds[n], strict=True))[:2] for n in unseen)
     shown = [pair for pairs in firsts for pair in pairs][:6]
     images = image_evaluation(options, config, limits, model, settings, shown)
-    return metrics[f"unseen {next(iter(unseen))}"] | metrics | images
+    return metrics | images
 
 
 def image_evaluation(

@@ -27,11 +27,6 @@ def write_report(title: str, m: dict[str, Any]) -> str:
     heads = {"set": "set", "clouds": "clouds", "relative_mse_3d": "relative 3D MSE"}
     heads |= {"median_relative_mse_3d": "median", "mse_3d": "3D MSE"}
     heads |= {"noise_floor_3d": "noise floor", "equal_rays": "equal paths"}
-    sets = [
-        {"set": name, **m[name]}
-        for name in m
-        if name.startswith("unseen") and not name.endswith("each")
-    ]
     times = {"method": "method", "relative_mse_2d": "relative 2D MSE"}
     times |= {"mse_2d": "2D MSE", "dssim_2d": "DSSIM", "seconds_3d": "f_3D s"}
     times |= {"seconds_2d": "f_2D s", "seconds": "total s"}
@@ -41,7 +36,7 @@ def write_report(title: str, m: dict[str, Any]) -> str:
         "mse_3d": "3D MSE",
     }
     each |= {"noise_floor_3d": "noise floor", "variance_3d": "variance"}
-    rows = [r for name in m if name.endswith(", each") for r in m[name]]
+    rows = report.unseen_clouds(m)
     media = ""
     if any("extinction" in row for row in rows):
         each |= {"extinction": "extinction", "ior": "index of refraction"}
@@ -66,7 +61,7 @@ the path-traced target (its noise is subtracted). Relative is over the variance 
 target, pooled over clouds and channels as a ratio of means; equal paths is the number
 of paths per point at which path tracing has the same MSE.
 
-{report.table_of(sets, heads)}
+{report.table_of(report.unseen_sets(m), heads)}
 ## Error against run time
 
 Means over {len(m["error_against_time_rows"]) // len(m["error_against_time"])} unseen

@@ -85,9 +85,10 @@ def as_points(name: str, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, 
     points = real_array(name, points).astype(np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"{name} has shape {points.shape}: give an array [N, 3]")
-    if not np.isfinite(points).all():
+    farthest = max(-points.min(initial=0.0), points.max(initial=0.0))
+    if not np.isfinite(farthest):
         raise InputError(f"{name} holds non-finite coordinates: remove those rows")
-    if points.size and np.abs(points).max() > FAR:
+    if farthest > FAR:
         raise InputError(f"{name} holds coordinates beyond {FAR:g}: scale them down")
     return points
 
@@ -119,7 +120,7 @@ def _search_block(
     order = _along_curve(padded, mask)
     turned = padded[order], mask[order], order
     under, columns = _columns(grid, *turned[:2], shell[1])
-    size = bucket(4 * rows)
+    size = bucket(8 * rows)
     near, need = _candidates(grid, under, bucket(int(columns)), size)
     if int(need) > size:
         size = bucket(int(need))

@@ -12,9 +12,6 @@ def write_report(m: dict[str, Any]) -> str:
     times = {"method": "method", "points": "points", "mse_2d": "2D MSE"}
     times |= {"dssim_2d": "DSSIM", "seconds_3d": "f_3D s", "seconds_2d": "f_2D s"}
     times |= {"seconds": "total s"}
-    pooled = [{"set": "unseen procedural shapes", **m}]
-    if "unseen_meshes_pooled" in m:
-        pooled.append({"set": "unseen meshes", **m["unseen_meshes_pooled"]})
     heads = {"set": "set", "clouds": "clouds", "mse_3d": "3D MSE"}
     heads |= {"relative_mse_3d": "relative 3D MSE", "noise_floor_3d": "noise floor"}
     heads |= {"median_relative_mse_3d": "median relative", "equal_rays": "equal rays"}
@@ -37,7 +34,7 @@ MSE is against the expectation of the ray-traced target (its noise is subtracted
 relative is over the variance of the target, pooled over the clouds; equal rays is the
 number of rays per point at which ray tracing has the same MSE.
 
-{report.table_of(pooled, heads)}
+{report.table_of(report.unseen_sets(m), heads)}
 ## Error against run time
 
 Means over {len(m["foreground_pixels"])} unseen objects at {options["resolution"]} x
@@ -57,4 +54,4 @@ after the paper's tone mapping, over the foreground.
 {report.markdown_table(list(seconds), [[f"{v:.1f} s" for v in seconds.values()]])}
 ## Every unseen object
 
-{report.table_of(m["unseen_shapes"] + m.get("unseen_meshes", []), columns)}"""
+{report.table_of(report.unseen_clouds(m), columns)}"""

@@ -137,9 +137,7 @@ def record_of(run: Path, metrics: Record, limits: Limits) -> Record:
     """What the manifest says of a run; paths are of whoever trained, so left out."""
     made = json.loads((run / "run.json").read_text())
     names = ("relative_mse_3d", "median_relative_mse_3d", "equal_rays", "clouds")
-    # Of ambient occlusion, the errors of the first set are those of the run.
-    first = {} if "unseen validation" in metrics else {"unseen shapes": metrics}
-    pooled = first | {
+    pooled = {
         key: value
         for key, value in metrics.items()
         if key.startswith("unseen") and isinstance(value, dict)

@@ -106,6 +106,21 @@ def table_of(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> s
     return markdown_table(list(columns.values()), cells)
 
 
+def unseen_sets(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The errors pooled over every set of unseen clouds, and over parts of them."""
+    return [
+        {"set": name, **found}
+        for name, found in metrics.items()
+        if name.startswith("unseen") and not name.endswith(", each")
+    ]
+
+
+def unseen_clouds(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The errors of every unseen cloud."""
+    each = (rows for name, rows in metrics.items() if name.endswith(", each"))
+    return [row for rows in each for row in rows]
+
+
 def beside_tracing(
     rows: Sequence[Mapping[str, Any]], count: str
 ) -> list[Mapping[str, Any]]:

@@ -231,10 +231,12 @@ def _irradiance(
     total, square = mi.Color3f(0), sampler.next_2d()
     for _ in range(samples):
         toward, radiance = scene.handle.sample_emitter_direction(
-            receiver, square, True, active
+            receiver, square, False, active
         )
-        cosine = dr.fmax(dr.dot(toward.d, normal), 0)
-        total += dr.select(toward.pdf > 0, radiance * cosine, 0)
+        cosine = dr.dot(toward.d, normal)
+        above = active & (toward.pdf > 0) & (cosine > 0)
+        met = scene.handle.ray_test(receiver.spawn_ray_to(toward.p), above)
+        total += dr.select(above & ~met, radiance * cosine, 0)
         square += mi.Point2f(LATTICE)
         square -= dr.floor(square)
     return total / samples

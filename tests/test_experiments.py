@@ -27,7 +27,7 @@ KEYS = (
     "seconds_compile",
     "seconds_train",
     "steps",
-    "unseen_shapes",
+    "unseen shapes",
 )
 SMALL = ao_train.Options(
     shapes=2,
@@ -95,11 +95,11 @@ def test_a_small_run_leaves_all_that_is_promised(tmp_path, monkeypatch):
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert not [key for key in KEYS if key not in metrics]
     assert metrics["steps"] == 2
-    assert len(metrics["unseen_shapes"]) == 2
+    assert len(metrics["unseen shapes, each"]) == 2
     rays = [r["mse_2d"] for r in metrics["error_against_time"] if "rays" in r]
     assert rays == sorted(rays, reverse=True)
     for name in ("learning_curve", "views", "error_against_time"):
         assert (tmp_path / f"{name}.png").stat().st_size > 1000
     text = (tmp_path / "report.md").read_text()
-    assert "unseen procedural shapes" in text
+    assert "unseen shapes | 2 |" in text
     assert "rays of equal MSE" in text

@@ -12,7 +12,7 @@ import tiny
 from benchmarks import generation
 from benchmarks import relight as relight_benchmark
 from experiments import gi_train, sss_train
-from ginn_jax import blocks, evaluate_light, presets, scenes
+from ginn_jax import blocks, evaluate_light, presets, scenes, train
 from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import LitCloud
 from ginn_jax.lit_options import LitOptions, choose_sources
@@ -200,22 +200,23 @@ def test_grey_light_on_grey_things_is_one_channel():
 
 
 def test_relight_benchmark(tmp_path, monkeypatch):
-    network = replace(tiny.ONE_LEVEL, lights=1, materials=1)
-    monkeypatch.setitem(relight_benchmark.NETWORKS, "illumination, linear", network)
     options = relight_benchmark.Options(
-        out=tmp_path,
-        resolution=24,
-        points=1000,
-        repeats=1,
-        networks=("illumination, linear",),
+        out=tmp_path, resolution=24, points=1000, repeats=1, networks=("ao",)
     )
+    with pytest.raises(InputError, match="ao takes no light"):
+        relight_benchmark.main(options)
+    with pytest.raises(InputError, match="no trained network 'none'"):
+        relight_benchmark.main(replace(options, networks=("none",)))
+    network = replace(tiny.ONE_LEVEL, lights=1, materials=1)
+    config = replace(tiny.CONFIG, network=network)
     monkeypatch.setattr(blocks, "BLOCK", 128)
     with tiny.cheap_compiling():
+        weights = jax.device_get(train.init_state(config).variables)
+        trained = config, tiny.ONE_LEVEL_LIMITS, weights
+        monkeypatch.setattr(relight_benchmark, "load_any", lambda name: trained)
         metrics = relight_benchmark.main(options)
     [row] = metrics["rows"]
     assert row["largest_difference"] < 1e-3
-    with pytest.raises(InputError, match="no network"):
-        relight_benchmark.main(replace(options, networks=("none",)))
 
 
 def test_generation_benchmark(tmp_path):
