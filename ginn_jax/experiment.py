@@ -88,9 +88,8 @@ def check_run(options: RunOptions, least: dict[str, int]) -> None:
 
 @dataclass
 class Clock:
-    """Wall seconds of the parts of a run."""
+    """Wall seconds of the parts of a run, with those before it was resumed."""
 
-    start: float = field(default_factory=time.perf_counter)
     parts: dict[str, float] = field(default_factory=dict)
 
     def lap(self, name: str, since: float) -> None:
@@ -195,7 +194,7 @@ def closing(
     """What metrics.json says of every run, whatever its effect."""
     seconds = {f"seconds_{name}": spent for name, spent in clock.parts.items()}
     return seconds | {
-        "seconds_total": time.perf_counter() - clock.start,
+        "seconds_total": sum(clock.parts.values()),
         "peak_memory_gib": report.peak_memory_gib(),
         "steps": int(run.state.step),
         "skipped_steps": int(run.state.skipped),
