@@ -17,7 +17,7 @@ from jaxtyping import Int
 from benchmarks.timing import circumstances, describe
 from ginn_jax import compare, evaluate, report
 from ginn_jax.commandline import require, require_positive, start
-from ginn_jax.compare_networks import Trained, errors_at_points, load_trained
+from ginn_jax.compare_networks import Trained, load_trained, rows_at_points
 from ginn_jax.dataset import count_asked, count_given
 from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import Cloud, LitCloud, take_points
@@ -56,6 +56,8 @@ class Options:
 
 QUICK = {"objects": 1, "shares": (1.0, 0.5), "points": 4000, "reference": 32}
 QUICK |= {"looks": 32}
+# Scenes that the report names.
+WORST = 8
 
 
 def main(options: Options) -> dict[str, Any]:
@@ -65,6 +67,8 @@ def main(options: Options) -> dict[str, Any]:
     require_positive(options, "radius")
     if not all(0.01 <= share <= 1 for share in options.shares):
         raise InputError(f"--shares {options.shares} must be from 0.01 to 1")
+    if not options.shares:
+        raise InputError("--shares is empty: give at least one")
     begin = time.perf_counter()
     counts = options.points, options.reference
     settings = compare.effect_settings(options.effect, *counts, options.radius)
@@ -75,14 +79,16 @@ def main(options: Options) -> dict[str, Any]:
     where = options.meshes, options.envmaps
     sources = compare.unseen_sources(options.effect, options.objects, *where, seed=0)
     clouds = [made_cloud(s, settings, options.out / "clouds") for s in sources]
-    rows = []
+    rows, each = [], []
     for share in options.shares:
         fewer = [thinned(cloud, share) for cloud in clouds]
         count = len(fewer[0].position)
-        given = {"ours": trained}, fewer, sources, with_points(settings, count)
-        found = errors_at_points(*given)[0]["ours"]
-        rows.append({"samples": count_given(count)} | found)
-    metrics = {"rows": rows} | circumstances(options, begin)
+        given = trained, fewer, sources, with_points(settings, count)
+        found, _ = rows_at_points(*given)
+        samples = {"samples": count_given(count)}
+        rows.append(samples | evaluate.pool_rows(found))
+        each += [samples | row for row in found]
+    metrics = {"rows": rows, "each": each} | circumstances(options, begin)
     text = write_report(options, trained, metrics)
     report.write_results(options.out, metrics, text)
     print(text)
@@ -112,11 +118,22 @@ def rows_of(count: int, share: float) -> Int[np.ndarray, "_"]:
     return np.r_[:first, given : given + total - first]
 
 
+def worst(each: list[evaluate.Row]) -> list[evaluate.Row]:
+    """The scenes that most of the pooled error is of, where all samples are given."""
+    most = max(row["samples"] for row in each)
+    rows = [row for row in each if row["samples"] == most]
+    total = sum(row["mse_3d"] for row in rows)
+    rows = [row | {"share": row["mse_3d"] / total} for row in rows]
+    return sorted(rows, key=lambda row: -row["mse_3d"])[:WORST]
+
+
 def write_report(options: Options, trained: Trained, metrics: evaluate.Row) -> str:
     """The table and how it was measured."""
     heads = {"samples": "samples given", "relative_mse_3d": "relative 3D MSE"}
     heads |= {"median_relative_mse_3d": "median", "noise_floor_3d": "noise floor"}
     heads |= {"equal_rays": "equal rays or paths"}
+    scene = {"name": "scene", "relative_mse_3d": "relative 3D MSE", "mse_3d": "3D MSE"}
+    scene |= {"share": "share of the error of all scenes"}
     return f"""# Error against the number of samples, effect {options.effect}
 
 {describe()}
@@ -126,7 +143,10 @@ the first of the same samples, and asked at the first of the same other points; 
 the reference ({options.reference} rays or paths) is subtracted. Relative: over the
 variance of the target, pooled over the scenes.
 
-{report.table_of(metrics["rows"], heads)}"""
+{report.table_of(metrics["rows"], heads)}
+Most of the error with all samples is of
+
+{report.table_of(worst(metrics["each"]), scene)}"""
 
 
 if __name__ == "__main__":

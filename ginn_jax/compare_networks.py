@@ -120,17 +120,24 @@ def errors_at_points(
     settings: Settings,
 ) -> tuple[dict[str, Row], dict[str, Trained]]:
     """3D errors of every network, and the networks with the limits they took."""
-    names, found = [s.name for s in sources], {}
-    for name, (network, limits, model) in networks.items():
-        given = network, limits, model, clouds, names
-        if isinstance(settings, Occlusion):
-            rows, limits = evaluate.evaluate_clouds(*given, settings.rays)
-            found[name] = evaluate.pool_rows(rows)
-        else:
-            rows, limits = evaluate_light.evaluate_lit_clouds(*given, settings)
-            found[name] = evaluate.pool_rows(rows)
-        networks[name] = network, limits, model
+    found = {}
+    for name, trained in networks.items():
+        rows, networks[name] = rows_at_points(trained, clouds, sources, settings)
+        found[name] = evaluate.pool_rows(rows)
     return found, networks
+
+
+def rows_at_points(
+    trained: Trained, clouds: list[Any], sources: list[Source], settings: Settings
+) -> tuple[list[Row], Trained]:
+    """3D errors on every cloud, and the network with the limits it took."""
+    network, limits, model = trained
+    given = network, limits, model, clouds, [s.name for s in sources]
+    if isinstance(settings, Occlusion):
+        rows, limits = evaluate.evaluate_clouds(*given, settings.rays)
+    else:
+        rows, limits = evaluate_light.evaluate_lit_clouds(*given, settings)
+    return rows, (network, limits, model)
 
 
 def network_picture(

@@ -117,7 +117,9 @@ def test_fewer_samples_are_given_and_others_asked(tmp_path, effect):
     assert whole["mse_3d"] != half["mse_3d"]
     # Asked where there is no target, half of the noise would be missing.
     assert half["noise_floor_3d"] == pytest.approx(whole["noise_floor_3d"], rel=0.3)
-    assert "| 1200 |" in (tmp_path / "report.md").read_text()
+    text = (tmp_path / "report.md").read_text()
+    assert "| 1200 |" in text
+    assert f"{whole['mse_3d']:.4g} | 1 |" in text
 
 
 @given(count=st.integers(100, 5000), share=st.floats(0.05, 1))
