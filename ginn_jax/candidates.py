@@ -84,7 +84,11 @@ def packet_candidates(
 ) -> tuple[Candidates, Int[Array, ""]]:
     """Points in the columns and layers that each packet reaches; how many in all."""
     slots = range_slots(under.shape[:, 0] * under.shape[:, 1], columns)
-    start, length = fill(partial(_column_run, grid, under, slots), slots.total, columns)
+    begin = under.first[:, 0] * grid.shape[1] + under.first[:, 1]
+    floor, top = (cell_of(grid, end[:, 2], 2) for end in (under.low, under.high))
+    packets = begin, jnp.maximum(under.shape[:, 1], 1), floor, top + 1
+    run = partial(_column_run, grid, packets, slots)
+    start, length = fill(run, slots.total, columns)
     runs = range_slots(length, candidates, slots.total)
     # The columns of a packet lie side by side, and so do their candidates.
     first = jnp.append(runs.begin, runs.total)[jnp.minimum(slots.begin, columns)]
@@ -95,19 +99,27 @@ def packet_candidates(
 
 
 def _column_run(
-    grid: VoxelGrid, under: Columns, slots: Slots, slot: Int[Array, "T"]
+    grid: VoxelGrid,
+    packets: tuple[Int[Array, "P"], ...],
+    slots: Slots,
+    slot: Int[Array, "T"],
 ) -> tuple[Int[Array, "T"], Int[Array, "T"]]:
-    """First row and number of the points that packets reach in one column each."""
+    """First row and number of the points that packets reach in one column each.
+
+    `packets` are each one's first column, columns across y, first layer and the layer
+    after its last.
+    """
     packet = slots.owner[slot]
-    row = slot - slots.begin[packet]
-    deep = jnp.maximum(under.shape[packet, 1], 1)
-    x, y = under.first[packet].T + jnp.stack([row // deep, row % deep])
+    begin, deep, floor, top = (of_packet[packet] for of_packet in packets)
+    number = slot - slots.begin[packet]
+    # Integer division is slow; as numbers are small against 2^22 this one is exact.
+    x = (number.astype(jnp.float32) + 0.5) / deep.astype(jnp.float32)
+    column = begin + number + x.astype(jnp.int32) * (grid.shape[1] - deep)
     real = slot < slots.total
-    column = jnp.where(real, x * grid.shape[1] + y, 0)
+    column = jnp.where(real, column, 0)
     first = grid.column_start[column]
     last = jnp.where(real, grid.column_start[column + 1], first)
-    floor, top = (cell_of(grid, e[packet, 2], 2) for e in (under.low, under.high))
-    start, stop = narrow_runs(grid.layer, first, last, floor, top + 1)
+    start, stop = narrow_runs(grid.layer, first, last, floor, top)
     return start, stop - start
 
 

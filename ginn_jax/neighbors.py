@@ -71,7 +71,8 @@ def find_neighbors(
 
     def search(first: int) -> list[tuple[Pairs, Int[np.ndarray, "K"]]]:
         block = queries[first : first + QUERY_BLOCK]
-        near = np.asarray(block - center, np.float32)
+        near = np.empty(block.shape, np.float32)
+        np.subtract(block, center, out=near, casting="same_kind")
         found = _search_block(grid, near, shell, first)
         return [_decide(pairs, points, queries, radius) for pairs in found]
 
@@ -101,8 +102,11 @@ def bucket(count: int) -> int:
 
 def pad_rows(array: np.ndarray, rows: int) -> tuple[np.ndarray, np.ndarray]:
     """The array with zero rows appended up to `rows`, and the mask of the real ones."""
+    mask = np.arange(rows) < len(array)
+    if rows == len(array):
+        return array, mask
     missing = [(0, rows - len(array))] + [(0, 0)] * (array.ndim - 1)
-    return np.pad(array, missing), np.arange(rows) < len(array)
+    return np.pad(array, missing), mask
 
 
 def _search_block(
@@ -118,7 +122,7 @@ def _search_block(
     rows = -(-bucket(len(queries)) // PACKET) * PACKET
     padded, mask = pad_rows(queries, rows)
     order = _along_curve(padded, mask)
-    turned = padded[order], mask[order], order
+    turned = padded.take(order, axis=0), mask, order  # padding stays last
     under, columns = _columns(grid, *turned[:2], shell[1])
     size = bucket(8 * rows)
     near, need = _candidates(grid, under, bucket(int(columns)), size)
