@@ -11,6 +11,7 @@ import numpy as np
 
 from ginn_jax.report import environment
 
+WARM = 0.05  # seconds
 Variants = Mapping[str, Callable[[], Any]]
 
 
@@ -53,13 +54,21 @@ class Timing(NamedTuple):
 def measure(variants: Variants, repeats: int) -> dict[str, Timing]:
     """Time each variant `repeats` times, in turns, after a first call of each.
 
-    Turns share out what else the machine does. Each call is over when its result is.
+    Turns share out what else the machine does. What one variant leaves behind, in
+    caches and in threads that spin, would fall on the next: every round has an order of
+    its own, and short calls come after others of the same that fill `WARM` and do not
+    count. Each call is over when its result is.
     """
     first = {name: clock(call) for name, call in variants.items()}
-    rounds = [
-        {name: clock(call) for name, call in variants.items()} for _ in range(repeats)
-    ]
-    return {n: Timing(first[n], tuple(turn[n] for turn in rounds)) for n in variants}
+    seconds: dict[str, list[float]] = {name: [] for name in variants}
+    order = np.random.default_rng(0)
+    for _ in range(repeats):
+        for name in order.permutation(list(variants)).tolist():
+            spent = min(seconds[name], default=0.0)
+            while spent < WARM:
+                spent += clock(variants[name])
+            seconds[name].append(clock(variants[name]))
+    return {name: Timing(first[name], tuple(seconds[name])) for name in variants}
 
 
 def clock(call: Callable[[], Any]) -> float:

@@ -9,13 +9,34 @@ import pytest
 from benchmarks import timing
 
 
-def test_measure_alternates_and_keeps_order():
+def test_measure_takes_turns_in_an_order_of_their_own(monkeypatch):
+    monkeypatch.setattr(timing, "WARM", 0.0)
     calls = []
-    variants = {name: lambda name=name: calls.append(name) for name in ("b", "a")}
-    timings = timing.measure(variants, repeats=3)
-    assert calls == ["b", "a"] * 4
-    assert list(timings) == ["b", "a"]
-    assert all(len(t.seconds) == 3 for t in timings.values())
+    names = ["c", "b", "a"]
+    variants = {name: lambda name=name: calls.append(name) for name in names}
+    timings = timing.measure(variants, repeats=9)
+    assert calls[:3] == names
+    rounds = [tuple(calls[i : i + 3]) for i in range(3, len(calls), 3)]
+    assert len(rounds) == 9
+    assert all(sorted(turn) == ["a", "b", "c"] for turn in rounds)
+    assert len(set(rounds)) > 3
+    assert list(timings) == names
+    assert all(len(t.seconds) == 9 for t in timings.values())
+
+
+@pytest.mark.parametrize(("seconds", "calls"), [(0.02, 1 + 4 + 3), (0.06, 1 + 1 + 2)])
+def test_short_calls_are_warmed_up(monkeypatch, seconds, calls):
+    """What fills the time to warm up in does not count; long calls need it once."""
+    made = []
+
+    def clock(call):
+        made.append(call)
+        return seconds
+
+    monkeypatch.setattr(timing, "clock", clock)
+    found = timing.measure({"a": lambda: None}, repeats=2)["a"]
+    assert found.seconds == (seconds, seconds)
+    assert len(made) == calls
 
 
 def test_timing_of_known_seconds():
