@@ -11,7 +11,7 @@ import numpy as np
 
 from ginn_jax.report import environment
 
-WARM = 0.05  # seconds
+WARM = 0.2  # seconds
 Variants = Mapping[str, Callable[[], Any]]
 
 

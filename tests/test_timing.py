@@ -24,7 +24,7 @@ def test_measure_takes_turns_in_an_order_of_their_own(monkeypatch):
     assert all(len(t.seconds) == 9 for t in timings.values())
 
 
-@pytest.mark.parametrize(("seconds", "calls"), [(0.02, 1 + 4 + 3), (0.06, 1 + 1 + 2)])
+@pytest.mark.parametrize(("seconds", "calls"), [(0.09, 1 + 4 + 3), (0.3, 1 + 1 + 2)])
 def test_short_calls_are_warmed_up(monkeypatch, seconds, calls):
     """What fills the time to warm up in does not count; long calls need it once."""
     made = []
