@@ -29,6 +29,12 @@ from ginn_jax.room import Room
 from ginn_jax.searches import uniform_limits
 
 
+@pytest.fixture(autouse=True)
+def at_once(monkeypatch):
+    """Times are not looked at."""
+    monkeypatch.setattr(timing, "WARM", 0.0)
+
+
 def test_quick_keeps_what_the_user_gave():
     options = neighbors.Options(points=77, quick=True)
     assert hasten(options, neighbors.QUICK).points == 77
