@@ -1,6 +1,7 @@
 """Trained networks that come with the package: they load, and are the ones measured."""
 
 import json
+import shutil
 from contextlib import nullcontext
 from functools import cache
 
@@ -52,6 +53,19 @@ def test_weights_come_back_bit_for_bit(exported):
     errors = pretrained.load_manifest(folder)["ao"]["errors"]
     assert list(errors) == ["unseen shapes"]
     assert errors["unseen shapes"]["relative_mse_3d"] == 0.5
+
+
+def test_errors_are_named_by_their_set(exported, tmp_path):
+    """Of the paper's split, the first set is not of shapes alone."""
+    _, _, run = exported
+    shutil.copytree(run, tmp_path / "run")
+    path = tmp_path / "run" / "metrics.json"
+    metrics = json.loads(path.read_text())
+    first = metrics.pop("unseen shapes")
+    sets = {f"unseen {name}": first for name in ("validation", "test")}
+    path.write_text(json.dumps(first | metrics | sets))
+    pretrained.export(tmp_path / "run", "ao", {}, tmp_path)
+    assert set(pretrained.load_manifest(tmp_path)["ao"]["errors"]) == set(sets)
 
 
 @pytest.mark.parametrize("begun", ["None", "runs/first"])
