@@ -23,7 +23,7 @@ from benchmarks.timing import Timing, circumstances, describe, measure
 from ginn_jax import blocks, image, inference, objects, reference, report
 from ginn_jax.architecture import Network
 from ginn_jax.camera import orbit_camera
-from ginn_jax.commandline import require, require_positive, start
+from ginn_jax.commandline import require, require_positive, require_some, start
 from ginn_jax.evaluate import at_scale
 from ginn_jax.limits import Limits, only
 from ginn_jax.mesh import find_meshes
@@ -183,6 +183,7 @@ def main(options: Options) -> dict[str, Any]:
     least = {"resolution": 32, "points": 500, "repeats": 1, "hidden": 1, "rays": 1}
     require(options, least)
     require_positive(options, "disks", "radii")
+    require_some(options, "disks")
     begin = time.perf_counter()
     scene, gbuffer = make_frame(options)
     pairs = zip(options.disks, options.radii, strict=True)

@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks.neighbors import surface, uniform
 from benchmarks.timing import circumstances, describe, measure
 from ginn_jax import report
-from ginn_jax.commandline import require, require_positive, start
+from ginn_jax.commandline import require, require_positive, require_some, start
 from ginn_jax.kernels import Kernel, init_kernel
 from ginn_jax.mcconv import mc_conv
 from ginn_jax.neighbors import find_neighbors
@@ -196,6 +196,7 @@ def main(options: Options) -> dict[str, Any]:
     """Compare on two clouds; returns what metrics.json holds."""
     require(options, {"points": 100, "channels": 1, "hidden": 1, "repeats": 1})
     require_positive(options, "radii")
+    require_some(options, "radii")
     begin = time.perf_counter()
     cases = [
         compare(options, c, r) for r in options.radii for c in ("uniform", "surface")

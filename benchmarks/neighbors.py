@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from benchmarks.peers import PEERS, Pairs, Search
 from benchmarks.timing import Timing, circumstances, describe, measure
 from ginn_jax import objects, report
-from ginn_jax.commandline import require, require_positive, start
+from ginn_jax.commandline import require, require_positive, require_some, start
 from ginn_jax.neighbors import find_neighbors
 from ginn_jax.samples import sample_surface
 
@@ -130,6 +130,7 @@ def main(options: Options) -> dict[str, Any]:
     """Compare on every cloud and radius; returns what metrics.json holds."""
     require(options, {"points": 1, "queries": 1, "repeats": 1, "seed": 0})
     require_positive(options, "radii")
+    require_some(options, "queries", "radii")
     begin = time.perf_counter()
     cases = [
         compare(options, c, r, n)

@@ -20,7 +20,7 @@ from rich.console import Console
 from benchmarks.timing import circumstances, describe
 from ginn_jax import evaluate_light, experiment, fit, report
 from ginn_jax.architecture import Network
-from ginn_jax.commandline import require_positive, start
+from ginn_jax.commandline import require_positive, require_some, start
 from ginn_jax.dataset import count_given
 from ginn_jax.evaluate import Model, pool_rows
 from ginn_jax.limits import Limits
@@ -76,6 +76,7 @@ Scenes = dict[str, tuple[Sequence[Source], list[LitCloud]]]
 def main(options: Options) -> dict[str, Any]:
     """Train and evaluate every preset; returns what metrics.json holds."""
     require_positive(options, "seconds")
+    require_some(options, "presets")
     console, begin = Console(), time.perf_counter()
     names = "out", "shapes", "test_shapes", "points", "paths", "resolution", "seed"
     run = LitOptions(**{name: getattr(options, name) for name in names})

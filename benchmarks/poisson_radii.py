@@ -17,7 +17,7 @@ from benchmarks.poisson_report import PAPER, draw, write_report
 from benchmarks.timing import circumstances
 from ginn_jax import compare, report
 from ginn_jax.camera import orbit_camera
-from ginn_jax.commandline import require, require_positive, start
+from ginn_jax.commandline import require, require_positive, require_some, start
 from ginn_jax.compare_networks import (
     Trained,
     at_disk_radius,
@@ -27,7 +27,6 @@ from ginn_jax.compare_networks import (
     points_given,
 )
 from ginn_jax.compare_tracing import trace
-from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Row
 from ginn_jax.objects import Source
 from ginn_jax.scenes import Settings, made_cloud
@@ -79,8 +78,7 @@ def main(options: Options) -> dict[str, Any]:
     least = {"objects": 1, "points": 1000, "resolution": 32, "reference": 2}
     require(options, least | {"looks": 1, "rounds": 1})
     require_positive(options, "radius", "times")
-    if not options.times:
-        raise InputError("--times is empty: give at least one")
+    require_some(options, "times")
     begin = time.perf_counter()
     counts = options.points, options.reference
     settings = compare.effect_settings(options.effect, *counts, options.radius)

@@ -19,7 +19,7 @@ from benchmarks.timing import Timing, circumstances, describe, measure
 from ginn_jax import inference, objects, reference, report
 from ginn_jax.architecture import Network
 from ginn_jax.camera import orbit_camera
-from ginn_jax.commandline import require, start
+from ginn_jax.commandline import require, require_some, start
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model
 from ginn_jax.evaluate_light import encode_lit
@@ -148,8 +148,7 @@ def row_of(times: dict[str, Timing]) -> dict[str, Any]:
 def main(options: Options) -> dict[str, Any]:
     """Time all networks; returns what metrics.json holds."""
     require(options, {"resolution": 16, "points": 1000, "repeats": 1})
-    if not options.networks:
-        raise InputError("--networks is empty: name at least one")
+    require_some(options, "networks")
     begin = time.perf_counter()
     rows = [compare(options, name) for name in options.networks]
     metrics = {"rows": rows} | circumstances(options, begin)

@@ -16,7 +16,7 @@ from jaxtyping import Int
 
 from benchmarks.timing import circumstances, describe
 from ginn_jax import compare, evaluate, report
-from ginn_jax.commandline import require, require_positive, start
+from ginn_jax.commandline import require, require_positive, require_some, start
 from ginn_jax.compare_networks import Trained, load_trained, rows_at_points
 from ginn_jax.dataset import count_asked, count_given
 from ginn_jax.errors import InputError
@@ -67,8 +67,7 @@ def main(options: Options) -> dict[str, Any]:
     require_positive(options, "radius")
     if not all(0.01 <= share <= 1 for share in options.shares):
         raise InputError(f"--shares {options.shares} must be from 0.01 to 1")
-    if not options.shares:
-        raise InputError("--shares is empty: give at least one")
+    require_some(options, "shares")
     begin = time.perf_counter()
     counts = options.points, options.reference
     settings = compare.effect_settings(options.effect, *counts, options.radius)

@@ -22,7 +22,7 @@ from benchmarks.timing import Timing, circumstances, describe, measure
 from ginn_jax import image, inference, objects, reference, report
 from ginn_jax.architecture import Network
 from ginn_jax.camera import orbit_camera
-from ginn_jax.commandline import require, start
+from ginn_jax.commandline import require, require_some, start
 from ginn_jax.presets import compact_network
 from ginn_jax.recipe import Training
 from ginn_jax.samples import sample_surface
@@ -122,6 +122,7 @@ def slope(rows: list[dict[str, Any]]) -> float:
 def main(options: Options) -> dict[str, Any]:
     """Time all sizes and fit; returns what metrics.json holds."""
     require(options, {"repeats": 1, "points": 100, "resolutions": 32})
+    require_some(options, "points", "resolutions")
     begin = time.perf_counter()
     scene = reference.build_scene(
         objects.load_object(objects.procedural_sources(1, UNSEEN_SEED)[0])

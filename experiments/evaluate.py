@@ -17,7 +17,7 @@ from rich.console import Console
 
 from ginn_jax import compare, compare_figures, compare_report, report
 from ginn_jax.camera import orbit_camera
-from ginn_jax.commandline import require, require_positive, start
+from ginn_jax.commandline import require, require_positive, require_some, start
 from ginn_jax.compare import Compared, Picture, Shot
 from ginn_jax.compare_light import counted_rows
 from ginn_jax.compare_networks import (
@@ -113,6 +113,7 @@ def main(options: Options) -> dict[str, Any]:
     least |= {"points": 1000, "looks": 1, "draws": 2, "counts": 1, "fewer_looks": 1}
     require(options, least)
     require_positive(options, "disks")
+    require_some(options, "counts")
     for scale in options.scales:
         shading_step(scale)
     console = Console()

@@ -134,6 +134,14 @@ def require(options: Any, least: Mapping[str, int]) -> None:
                 raise InputError(f"--{flag} is {value}: give at most {LARGEST_INDEX}")
 
 
+def require_some(options: Any, *names: str) -> None:
+    """Raise `InputError` for the first option of several values that has none."""
+    for name in names:
+        if not _values(options, name):
+            flag = name.replace("_", "-")
+            raise InputError(f"--{flag} is empty: give at least one")
+
+
 def _values(options: Any, name: str) -> tuple[Any, ...]:
     """The values of an option: several, one, or none where it is left out."""
     value = getattr(options, name)

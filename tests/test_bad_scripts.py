@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from damaged import contents
 
-from benchmarks import neighbors, scaling
+from benchmarks import neighbors, relight, scaling
 from experiments import animation, ao_train, evaluate, gi_train
 from ginn_jax import (
     commandline,
@@ -68,6 +68,8 @@ SEVERAL = [
     (animation, ("--disks", "-1"), "--disks is -1.0: give it above 0"),
     (neighbors, ("--radii", ".1", "0"), "--radii is 0.0: give it above 0"),
     (scaling, ("--points", "1000", "-4"), "--points is -4: give at least 100"),
+    (scaling, ("--resolutions",), "--resolutions is empty: give at least one"),
+    (relight, ("--networks",), "--networks is empty: give at least one"),
 ]
 
 
