@@ -81,8 +81,9 @@ def over_points(options: Options, scene: reference.Scene) -> list[dict[str, Any]
         encoded, limits = inference.encode_cloud(network, limits, *arguments, key=key)
         call = partial(inference.encode_cloud, network, limits, *arguments, key=key)
         timing = measure({"f_3D": call}, options.repeats)["f_3D"]
-        kept = int(np.sum(encoded.points.mask))
-        rows.append({"size": count, "kept": kept, "timing": timing})
+        mask = encoded.points.mask
+        sizes = {"size": count, "kept": int(np.sum(mask)), "rows": len(mask)}
+        rows.append(sizes | {"timing": timing})
     return rows
 
 
@@ -122,7 +123,8 @@ def slope(rows: list[dict[str, Any]]) -> float:
 def main(options: Options) -> dict[str, Any]:
     """Time all sizes and fit; returns what metrics.json holds."""
     require(options, {"repeats": 1, "points": 100, "resolutions": 32})
-    require_some(options, "points", "resolutions")
+    # A slope is fitted to them.
+    require_some(options, "points", "resolutions", least=2)
     begin = time.perf_counter()
     scene = reference.build_scene(
         objects.load_object(objects.procedural_sources(1, UNSEEN_SEED)[0])
@@ -157,7 +159,13 @@ def write_report(
         return 1e6 * timing.median / row["size"]
 
     points = [
-        [r["size"], r["kept"], str(r["timing"]), microseconds(r, r["timing"])]
+        [
+            r["size"],
+            r["kept"],
+            r["rows"],
+            str(r["timing"]),
+            microseconds(r, r["timing"]),
+        ]
         for r in tables["points"]
     ]
     pixels = [
@@ -170,7 +178,7 @@ def write_report(
         ]
         for r in tables["pixels"]
     ]
-    heads = ["points", "after Poisson disk", "f_3D", "µs a point"]
+    heads = ["points", "after Poisson disk", "in rows", "f_3D", "µs a point"]
     flat = ["frame", "pixels", "f_2D", "µs a pixel", "scratch of a block, MiB"]
     return f"""# Scaling
 

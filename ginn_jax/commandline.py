@@ -134,12 +134,12 @@ def require(options: Any, least: Mapping[str, int]) -> None:
                 raise InputError(f"--{flag} is {value}: give at most {LARGEST_INDEX}")
 
 
-def require_some(options: Any, *names: str) -> None:
-    """Raise `InputError` for the first option of several values that has none."""
+def require_some(options: Any, *names: str, least: int = 1) -> None:
+    """Raise `InputError` for the first option with fewer than so many values."""
     for name in names:
-        if not _values(options, name):
+        if (count := len(_values(options, name))) < least:
             flag = name.replace("_", "-")
-            raise InputError(f"--{flag} is empty: give at least one")
+            raise InputError(f"--{flag} has {count} values: give at least {least}")
 
 
 def _values(options: Any, name: str) -> tuple[Any, ...]:

@@ -41,6 +41,7 @@ LONGEST = (
     "train",
     "experiments",
     "benchmarks",
+    "benchmark_networks",
     "geometry",
     "limits",
     "image",

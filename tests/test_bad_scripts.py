@@ -68,8 +68,8 @@ SEVERAL = [
     (animation, ("--disks", "-1"), "--disks is -1.0: give it above 0"),
     (neighbors, ("--radii", ".1", "0"), "--radii is 0.0: give it above 0"),
     (scaling, ("--points", "1000", "-4"), "--points is -4: give at least 100"),
-    (scaling, ("--resolutions",), "--resolutions is empty: give at least one"),
-    (relight, ("--networks",), "--networks is empty: give at least one"),
+    (scaling, ("--points", "1000"), "--points has 1 values: give at least 2"),
+    (relight, ("--networks",), "--networks has 0 values: give at least 1"),
 ]
 
 

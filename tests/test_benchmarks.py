@@ -1,6 +1,5 @@
 """The benchmarks run and say what they should; how long things take is not tested."""
 
-import json
 from dataclasses import replace
 from functools import partial
 from inspect import unwrap
@@ -10,23 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny
+from left_behind import check_files
 
 from benchmarks import (
     f2d,
-    mc_conv,
     neighbors,
-    networks,
     poisson_radii,
     scaling,
     timing,
     train_step,
 )
-from ginn_jax import blocks, presets, scenes
+from ginn_jax import blocks, presets
 from ginn_jax.commandline import hasten
 from ginn_jax.disk_radius import with_disk_radius
 from ginn_jax.errors import InputError
-from ginn_jax.room import Room
-from ginn_jax.searches import uniform_limits
 
 
 @pytest.fixture(autouse=True)
@@ -46,42 +42,6 @@ def test_disks_of_the_benchmark_suit_every_network():
         network = next(iter(effect.values()))
         for factor in poisson_radii.Options.times:
             with_disk_radius(network, factor * network.levels[0])
-
-
-def test_pairs_may_differ_at_the_radius_only():
-    points = np.array([[0.0, 0, 0], [1 + 1e-7, 0, 0], [0.5, 0, 0]])
-    queries = np.zeros((1, 3))
-    two, three = ((np.zeros(n, int), np.array([0, 2, 1][:n])) for n in (2, 3))
-    same = neighbors.same_but_for_rounding
-    assert same(two, three, points, queries, 1.0)
-    assert not same(two, three, points, queries, 1.1)
-    assert not same(three, (two[0][:1], two[1][:1]), points, queries, 1.0)
-    assert not same(two, (np.zeros(3, int), np.array([0, 2, 2])), points, queries, 1.0)
-
-
-def test_neighbors(tmp_path, monkeypatch):
-    def absent():
-        raise ImportError
-
-    monkeypatch.setitem(neighbors.PEERS, "absent", absent)
-    options = neighbors.Options(
-        tmp_path, points=300, queries=(500,), radii=(0.1,), repeats=1
-    )
-    metrics = neighbors.main(options)
-    assert "absent ()" in metrics["missing"]
-    assert [case["cloud"] for case in metrics["cases"]] == list(neighbors.CLOUDS)
-    assert all(case["pairs"] > 0 for case in metrics["cases"])
-    check_files(tmp_path, "neighbors.png")
-
-
-def test_neighbors_stops_at_a_search_that_is_wrong(tmp_path, monkeypatch):
-    def wrong(points, queries, radius):
-        return tuple(a[1:] for a in neighbors.find_neighbors(points, queries, radius))
-
-    monkeypatch.setitem(neighbors.PEERS, "wrong", lambda: wrong)
-    options = neighbors.Options(tmp_path, points=200, queries=(200,), radii=(0.1,))
-    with pytest.raises(AssertionError, match="wrong found other pairs"):
-        neighbors.main(options)
 
 
 def test_train_step(tmp_path, monkeypatch):
@@ -163,89 +123,6 @@ def test_f2d(tmp_path, monkeypatch):
     assert "straightforward / ours" in text
 
 
-def test_networks_at_equal_time(tmp_path, monkeypatch):
-    """As many steps as fit the time; a row for each, of the same unseen scenes."""
-    network = replace(tiny.ONE_LEVEL, lights=1, materials=1)
-    table = {"homogeneous": network, "linear": replace(network, splat=True)}
-    monkeypatch.setattr(networks, "ILLUMINATION", table)
-
-    def step_seconds(config, _):
-        return 0.3 if config.network.splat else 0.5
-
-    monkeypatch.setattr(networks, "step_seconds", step_seconds)
-    limits = uniform_limits(network, 1 << 15)
-    monkeypatch.setattr("ginn_jax.fit.training_room", lambda *_: Room(limits, limits))
-    monkeypatch.setattr(blocks, "BLOCK", 128)
-    monkeypatch.setattr(scenes, "ProcessPoolExecutor", tiny.Here)
-    options = networks.Options(
-        tmp_path,
-        presets=tuple(table),
-        seconds=1.1,
-        shapes=2,
-        test_shapes=1,
-        points=1000,
-        paths=2,
-        resolution=32,
-        quick=True,
-    )
-    with tiny.cheap_compiling(), jax.numpy_dtype_promotion("standard"):
-        rows = networks.main(options)["rows"]
-    found = [(row["preset"], row["steps"]) for row in rows]
-    assert found == [("homogeneous", 2), ("linear", 4)]
-    for row in rows:
-        for name in ("shapes", "point lights"):
-            assert np.isfinite(row[f"relative, {name}"])
-    assert "homogeneous" in (tmp_path / "report.md").read_text()
-
-
-def test_step_is_timed_once_it_is_compiled_and_has_room(monkeypatch):
-    """A step that compiles, or that is repeated in more room, does not count."""
-    found = iter(["small", None, "large", "large", "large"])
-    ticks = iter(range(100))
-
-    def step(config, room, clouds, state):
-        used = next(found)
-        return state, 0.0, used, room
-
-    monkeypatch.setattr(networks, "PROBE", 2)
-    monkeypatch.setattr(networks.fit, "step_with_room", step)
-    monkeypatch.setattr(networks, "training_room", lambda *_: None)
-    monkeypatch.setattr(networks, "init_state", lambda *_: None)
-    monkeypatch.setattr(networks.time, "perf_counter", lambda: next(ticks) ** 2)
-    # The fourth and the fifth; begun at 4 and 6 (or so), over at 5 and 7.
-    assert networks.step_seconds(None, []) == ((4**2 - 3**2) + (6**2 - 5**2)) / 2
-    assert next(found, "none left") == "none left"
-
-
-def test_mc_conv_without_peers(tmp_path, monkeypatch):
-    def absent(*_):
-        raise ImportError
-
-    monkeypatch.setattr(mc_conv, "in_torch", absent)
-    monkeypatch.setattr(mc_conv, "in_open3d", absent)
-    options = mc_conv.Options(tmp_path, points=200, radii=(0.2,), repeats=1)
-    metrics = mc_conv.main(options)
-    assert metrics["cases"][0]["missing"][0] == "PyTorch"
-    assert metrics["cases"][0]["edges"] > 200
-    assert "PyTorch" in (tmp_path / "report.md").read_text()
-
-
-def test_mc_conv_compares_with_a_peer():
-    """A stand-in peer: ours with the blocks of its kernel taken apart."""
-    options = mc_conv.Options(points=200)
-    points = mc_conv.uniform(np.random.default_rng(0), 200)
-    mine = mc_conv.ours(mc_conv.make_layer(options, 0.2, points))
-
-    def flat(wrong=0.0):
-        kernel, features = mine["gradient"]()
-        return [*(a[0] for a in kernel), features + wrong]
-
-    peer = {"forward": mine["forward"], "gradient": flat}
-    assert mc_conv.check(mine, peer) == 0
-    with pytest.raises(AssertionError, match="differ"):
-        mc_conv.check(mine, peer | {"gradient": lambda: flat(1.0)})
-
-
 def test_scaling(tmp_path, monkeypatch):
     stand_in(monkeypatch)
     monkeypatch.setattr(scaling, "network_for", lambda _: tiny.ONE_LEVEL)
@@ -294,11 +171,3 @@ def stand_in(monkeypatch):
 def untrained(config):
     """The first state of a network, compiled once for all tests."""
     return tiny.fresh_state(replace(tiny.CONFIG, network=config.network))
-
-
-def check_files(folder, figure):
-    """The three files, and what every metrics.json has."""
-    metrics = json.loads((folder / "metrics.json").read_text())
-    assert {"options", "environment", "seconds_total"} <= set(metrics)
-    assert (folder / "report.md").read_text().startswith("# ")
-    assert (folder / figure).stat().st_size > 1000

@@ -1,0 +1,66 @@
+"""Networks that train for the same time, and how long one of their steps takes."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import tiny
+
+from benchmarks import networks
+from ginn_jax import blocks, scenes
+from ginn_jax.room import Room
+from ginn_jax.searches import uniform_limits
+
+
+def test_networks_at_equal_time(tmp_path, monkeypatch):
+    """As many steps as fit the time; a row for each, of the same unseen scenes."""
+    network = replace(tiny.ONE_LEVEL, lights=1, materials=1)
+    table = {"homogeneous": network, "linear": replace(network, splat=True)}
+    monkeypatch.setattr(networks, "ILLUMINATION", table)
+
+    def step_seconds(config, _):
+        return 0.3 if config.network.splat else 0.5
+
+    monkeypatch.setattr(networks, "step_seconds", step_seconds)
+    limits = uniform_limits(network, 1 << 15)
+    monkeypatch.setattr("ginn_jax.fit.training_room", lambda *_: Room(limits, limits))
+    monkeypatch.setattr(blocks, "BLOCK", 128)
+    monkeypatch.setattr(scenes, "ProcessPoolExecutor", tiny.Here)
+    options = networks.Options(
+        tmp_path,
+        presets=tuple(table),
+        seconds=1.1,
+        shapes=2,
+        test_shapes=1,
+        points=1000,
+        paths=2,
+        resolution=32,
+        quick=True,
+    )
+    with tiny.cheap_compiling(), jax.numpy_dtype_promotion("standard"):
+        rows = networks.main(options)["rows"]
+    found = [(row["preset"], row["steps"]) for row in rows]
+    assert found == [("homogeneous", 2), ("linear", 4)]
+    for row in rows:
+        for name in ("shapes", "point lights"):
+            assert np.isfinite(row[f"relative, {name}"])
+    assert "homogeneous" in (tmp_path / "report.md").read_text()
+
+
+def test_step_is_timed_once_it_is_compiled_and_has_room(monkeypatch):
+    """A step that compiles, or that is repeated in more room, does not count."""
+    found = iter(["small", None, "large", "large", "large"])
+    ticks = iter(range(100))
+
+    def step(config, room, clouds, state):
+        used = next(found)
+        return state, 0.0, used, room
+
+    monkeypatch.setattr(networks, "PROBE", 2)
+    monkeypatch.setattr(networks.fit, "step_with_room", step)
+    monkeypatch.setattr(networks, "training_room", lambda *_: None)
+    monkeypatch.setattr(networks, "init_state", lambda *_: None)
+    monkeypatch.setattr(networks.time, "perf_counter", lambda: next(ticks) ** 2)
+    # The fourth and the fifth; begun at 4 and 6 (or so), over at 5 and 7.
+    assert networks.step_seconds(None, []) == ((4**2 - 3**2) + (6**2 - 5**2)) / 2
+    assert next(found, "none left") == "none left"
