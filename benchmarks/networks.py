@@ -1,4 +1,4 @@
-"""Networks trained for equal time on the same scenes: homogeneous, linear in light.
+"""Networks trained for equal time on the same scenes: of three widths, or linear.
 
     python -m benchmarks.networks --effect gi
 
@@ -47,7 +47,7 @@ class Options:
     """Folder for clouds, runs, metrics.json and report.md."""
     effect: Literal["gi", "sss"] = "gi"
     """Global illumination or subsurface scattering."""
-    presets: tuple[Preset, ...] = ("homogeneous", "linear")
+    presets: tuple[Preset, ...] = ("homogeneous", "linear", "narrow", "wide")
     """The networks."""
     seconds: float = 240.0
     """Seconds of training for each."""

@@ -25,7 +25,8 @@ class Options(LitOptions):
     out: Path = Path("runs/gi_train")
     """Folder for data, checkpoints, metrics.json, report.md and figures."""
     preset: Preset = "homogeneous"
-    """Homogeneous in light, exactly linear, the authors' table, or an ablation."""
+    """Homogeneous in light, the same half or twice as wide, exactly linear, the
+    authors' table, or an ablation."""
 
 
 def main(options: Options) -> dict[str, Any]:

@@ -26,7 +26,8 @@ class Options(LitOptions):
     out: Path = Path("runs/sss_train")
     """Folder for data, checkpoints, metrics.json, report.md and figures."""
     preset: Preset = "homogeneous"
-    """Homogeneous in light, exactly linear, the authors' table, or an ablation."""
+    """Homogeneous in light, the same half or twice as wide, exactly linear, the
+    authors' table, or an ablation."""
     paths: int = 16
     """Paths per training point."""
     steps: int = 1500

@@ -21,7 +21,9 @@ from ginn_jax.objects import (
 )
 from ginn_jax.pairing import PAPER_SPLIT, mixed, pair_up, split_apart, spread
 
-Preset = Literal["homogeneous", "linear", "released", "only_2d", "only_3d"]
+Preset = Literal[
+    "homogeneous", "linear", "narrow", "wide", "released", "only_2d", "only_3d"
+]
 
 
 @dataclass(frozen=True)

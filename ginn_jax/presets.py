@@ -115,6 +115,21 @@ def only_3d(network: Network) -> Network:
     return replace(network, splat=True)
 
 
+def in_width(network: Network, factor: float) -> Network:
+    """The same table with so many times the channels."""
+
+    def scaled(conv: Conv) -> Conv:
+        return replace(conv, channels=round(factor * conv.channels))
+
+    return replace(
+        network,
+        encoder=tuple(map(scaled, network.encoder)),
+        query=scaled(network.query),
+        latent=round(factor * network.latent),
+        head=round(factor * network.head),
+    )
+
+
 def with_ablations(network: Network) -> dict[str, Network]:
     """The paper's ablations of a network."""
     return {"only_2d": only_2d(network), "only_3d": only_3d(network)}
@@ -157,6 +172,8 @@ def for_light(network: Network) -> dict[str, Network]:
     return {
         "homogeneous": network,
         "linear": replace(network, linear=True, local=False, beams=0),
+        "narrow": in_width(network, 0.5),
+        "wide": in_width(network, 2.0),
         "released": replace(
             RELEASED,
             lights=1,

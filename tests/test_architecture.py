@@ -1,5 +1,7 @@
 """The tables of layers against the authors'."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import pytest
@@ -7,7 +9,7 @@ import pytest
 from ginn_jax.architecture import QUERY
 from ginn_jax.geometry import Geometry
 from ginn_jax.network import Encoder, Shader
-from ginn_jax.presets import PAPER, RELEASED
+from ginn_jax.presets import ILLUMINATION, PAPER, RELEASED, SCATTERING
 from ginn_jax.receptive_field import Field, Oriented
 
 # From the authors' release: levels, radius, bandwidth, channels, channels with skip,
@@ -127,3 +129,19 @@ def test_paper_differs_in_radii_and_blocks():
     # Blocks 3-8-8-8: 176 parameters for 8 values.
     assert size(encoder["params"]["conv_1"]["kernel"]) == 3 * 176
     assert size(encoder["params"]["conv_4"]["kernel"]) == 8 * 176
+
+
+@pytest.mark.parametrize("table", [ILLUMINATION, SCATTERING], ids=["gi", "sss"])
+def test_widths_differ_in_channels_alone(table):
+    usual = table["homogeneous"]
+    for name, factor in (("narrow", 0.5), ("wide", 2)):
+        other = table[name]
+        rows, usual_rows = ((*n.encoder, n.query) for n in (other, usual))
+        for row, conv in zip(rows, usual_rows, strict=True):
+            assert row == replace(conv, channels=int(factor * conv.channels))
+        assert (other.latent, other.head) == (
+            factor * usual.latent,
+            factor * usual.head,
+        )
+        same = {n: getattr(usual, n) for n in ("encoder", "query", "latent", "head")}
+        assert replace(other, **same) == usual
