@@ -4,9 +4,11 @@
 
 The same layer on the same edges: a kernel perceptron of offsets and normals per edge,
 times the features of the sender, summed at the receiver; gradients of all weights and
-of the features. PyTorch's is written with gather, matrix products and `index_add_`.
-Results are compared before anything is timed. Open3D's ContinuousConv is another layer
-(a grid of weights instead of a perceptron): its time stands beside, not its result.
+of the features. The batch has a cloud for every core, as in training. Ours gives each
+core its cloud. PyTorch's takes the batch as one cloud on all cores, or each cloud on a
+thread of its own, whichever is faster. Results are compared before anything is timed.
+Open3D's ContinuousConv is another layer (a grid of weights instead of a perceptron):
+its time stands beside, not its result, and is of one cloud.
 """
 
 import time
@@ -20,17 +22,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.mc_conv_peers import INPUTS, PEERS, Calls, Layer, make_layer
 from benchmarks.neighbors import surface, uniform
 from benchmarks.timing import circumstances, describe, measure
 from ginn_jax import report
+from ginn_jax.blocks import each_its_own, everywhere, for_each_block
 from ginn_jax.commandline import require, require_positive, require_some, start
-from ginn_jax.kernels import Kernel, init_kernel
+from ginn_jax.kernels import Kernel
 from ginn_jax.mcconv import mc_conv
-from ginn_jax.neighbors import find_neighbors
-from ginn_jax.process import available_cores
+from ginn_jax.process import ALONE
 from ginn_jax.receptive_field import Field
 
-INPUTS = 7
 TOLERANCE = 1e-4
 
 
@@ -41,7 +43,7 @@ class Options:
     out: Path = Path("runs/mc_conv")
     """Folder for metrics.json and report.md."""
     points: int = 10_000
-    """Points of the cloud, senders and receivers alike."""
+    """Points of each cloud, senders and receivers alike."""
     radii: tuple[float, ...] = (0.025, 0.05)
     """Radii of the receptive field."""
     channels: int = 24
@@ -59,93 +61,47 @@ class Options:
 QUICK = {"points": 1000, "radii": (0.05,), "repeats": 2}
 
 
-def make_layer(
-    options: Options, radius: float, points: np.ndarray
-) -> tuple[Kernel, jax.Array, Field, jax.Array]:
-    """Kernel, features, edges of a cloud with itself, and a cotangent."""
-    rng = np.random.default_rng(options.seed)
-    receiver, sender = find_neighbors(points, points, radius)
-    inputs = rng.normal(size=(INPUTS, len(sender))).astype(np.float32)
-    inputs[:3] = ((points[receiver] - points[sender]) / radius).T
-    key = jax.random.key(options.seed)
-    width = options.channels
-    kernel = init_kernel(INPUTS, width, options.hidden, width, key=key)
-    weight = rng.uniform(0.5, 1.5, len(sender)).astype(np.float32)
-    weight[at_kink(kernel, inputs)] = 0
-    edges = (sender, receiver, inputs, weight, np.int32(len(sender)))
-    field = Field(*map(jnp.asarray, edges))
-    features, cotangent = (
-        jnp.asarray(rng.normal(size=(len(points), width)), jnp.float32)
-        for _ in range(2)
-    )
-    return kernel, features, field, cotangent
+def ours(layer: Layer) -> Calls:
+    """Forward and gradient, every device its cloud."""
+    count = layer.features.shape[1]
 
+    def forward(kernel: Kernel, cloud: Any) -> Any:
+        features, field, _ = cloud
+        return mc_conv(kernel, features, field, count)
 
-def at_kink(kernel: Kernel, inputs: np.ndarray) -> np.ndarray:
-    """The few edges so near a kink of a ReLU that rounding chooses the slope there."""
-    w1, b1, w2, b2, *_ = (np.asarray(a[0], np.float64) for a in kernel)
-    first = inputs.T @ w1 + b1
-    second = np.maximum(first, 0) @ w2 + b2
-    return np.any(np.abs(np.concatenate([first, second], axis=1)) < 1e-5, axis=1)
+    def gradient(kernel: Kernel, cloud: Any) -> Any:
+        def objective(kernel: Kernel, features: Any) -> Any:
+            made = forward(kernel, (features, *cloud[1:]))
+            return jnp.sum(made * cloud[2])
 
+        return jax.grad(objective, argnums=(0, 1))(kernel, cloud[0])
 
-def ours(layer: Any) -> dict[str, Callable[[], Any]]:
-    """Forward and gradient on all devices' threads, as one call."""
-    *arguments, cotangent = layer
-    count = cotangent.shape[0]
+    @partial(jax.jit, compiler_options=ALONE)
+    def all_gradients(kernel: Kernel, batch: Any) -> Any:
+        kernels, features = for_each_block(gradient, kernel, batch)
+        return jax.tree.map(lambda a: a.sum(axis=0), kernels), features
 
-    def objective(kernel: Kernel, features: Any, field: Field) -> Any:
-        return jnp.sum(mc_conv(kernel, features, field, count) * cotangent)
+    @partial(jax.jit, compiler_options=ALONE)
+    def all_forward(kernel: Kernel, batch: Any) -> Any:
+        return for_each_block(forward, kernel, batch)
 
-    forward = jax.jit(lambda k, x, f: mc_conv(k, x, f, count))
-    gradient = jax.jit(jax.grad(objective, argnums=(0, 1)))
+    batch = layer.features, Field(*map(jnp.asarray, layer.edges)), layer.cotangent
+    given = everywhere(layer.kernel), each_its_own(batch)
     return {
-        "forward": partial(forward, *arguments),
-        "gradient": partial(gradient, *arguments),
+        "forward": partial(all_forward, *given),
+        "gradient": partial(all_gradients, *given),
     }
 
 
-def in_torch(layer: Any) -> dict[str, Callable[[], Any]]:
-    """The plain PyTorch version on all cores; raises ImportError without PyTorch."""
-    import torch  # pyright: ignore
-
-    torch.set_num_threads(available_cores())
-    kernel, features, field, cotangent = jax.tree.map(np.asarray, layer)
-    weights = [torch.tensor(a[0]) for a in kernel]
-    x, given = torch.tensor(features), torch.tensor(cotangent)
-    inputs = torch.tensor(np.ascontiguousarray(field.inputs.T))
-    sender, receiver = (torch.tensor(a.astype(np.int64)) for a in field[:2])
-    weight = torch.tensor(field.weight)[:, None]
-
-    def apply(weights: Any, x: Any) -> Any:
-        w1, b1, w2, b2, w3, b3 = weights
-        hidden = torch.relu(torch.addmm(b1, inputs, w1))
-        values = torch.addmm(b3, torch.relu(torch.addmm(b2, hidden, w2)), w3)
-        total = torch.zeros_like(given)
-        return total.index_add_(0, receiver, values * x[sender] * weight)
-
-    def forward() -> Any:
-        with torch.no_grad():
-            return apply(weights, x)
-
-    def gradient() -> Any:
-        leaves = [a.clone().requires_grad_() for a in (*weights, x)]
-        return torch.autograd.grad(
-            (apply(leaves[:-1], leaves[-1]) * given).sum(), leaves
-        )
-
-    return {"forward": forward, "gradient": gradient}
-
-
-def in_open3d(layer: Any, points: np.ndarray, radius: float) -> Callable[[], Any]:
+def in_open3d(layer: Layer, points: np.ndarray, radius: float) -> Callable[[], Any]:
     """Open3D's ContinuousConv of the same width, forward, its search included."""
     import open3d.ml.torch as ml  # pyright: ignore
     import torch  # pyright: ignore
 
-    width = layer[1].shape[1]
+    width = layer.features.shape[2]
     conv = ml.layers.ContinuousConv(width, width, kernel_size=[4, 4, 4])
     place = torch.tensor(points, dtype=torch.float32)
-    x = torch.tensor(np.asarray(layer[1]))
+    x = torch.tensor(layer.features[0])
 
     def forward() -> Any:
         with torch.no_grad():
@@ -154,9 +110,7 @@ def in_open3d(layer: Any, points: np.ndarray, radius: float) -> Callable[[], Any
     return forward
 
 
-def check(
-    mine: dict[str, Callable[[], Any]], theirs: dict[str, Callable[[], Any]]
-) -> float:
+def check(mine: Calls, theirs: Calls) -> float:
     """Largest difference relative to the largest value; AssertionError if too large."""
     worst = 0.0
     kernel, features = mine["gradient"]()
@@ -173,20 +127,24 @@ def check(
 def compare(options: Options, cloud: str, radius: float) -> dict[str, Any]:
     """Agreement and times on one cloud."""
     rng = np.random.default_rng(options.seed)
-    points = {"uniform": uniform, "surface": surface}[cloud](rng, options.points)
-    layer = make_layer(options, radius, points)
+    draw = {"uniform": uniform, "surface": surface}[cloud]
+    clouds = [draw(rng, options.points) for _ in range(jax.device_count())]
+    widths = options.channels, options.hidden
+    layer = make_layer(clouds, radius, *widths, options.seed)
     mine = ours(layer)
     calls = {f"ours, {name}": call for name, call in mine.items()}
     case: dict[str, Any] = {"cloud": cloud, "radius": radius, "missing": []}
-    case |= {"edges": int(layer[2].count), "difference": float("nan")}
+    case |= {"edges": int(layer.edges.count.sum()), "difference": float("nan")}
+    for name, peer in PEERS.items():
+        try:
+            theirs = peer(layer)
+        except ImportError:
+            case["missing"].append(name)
+            continue
+        case["difference"] = np.nanmax([case["difference"], check(mine, theirs)])
+        calls |= {f"{name}, {part}": call for part, call in theirs.items()}
     try:
-        theirs = in_torch(layer)
-        case["difference"] = check(mine, theirs)
-        calls |= {f"PyTorch, {name}": call for name, call in theirs.items()}
-    except ImportError:
-        case["missing"].append("PyTorch")
-    try:
-        calls["Open3D ContinuousConv, forward"] = in_open3d(layer, points, radius)
+        calls["Open3D ContinuousConv, forward"] = in_open3d(layer, clouds[0], radius)
     except Exception as error:  # its builds refuse many versions of PyTorch
         case["missing"].append(f"Open3D ContinuousConv ({type(error).__name__})")
     return case | {"timings": measure(calls, options.repeats)}
@@ -214,8 +172,8 @@ def write_report(options: Options, cases: list[dict[str, Any]]) -> str:
     """report.md: times and ratios, a row for each cloud and radius."""
     names = list(cases[0]["timings"])
     heads = ["cloud", "radius", "edges", *names]
-    peer = "PyTorch, gradient" in names
-    heads += ["PyTorch / ours, forward", "PyTorch / ours, gradient"] if peer else []
+    peers = [name for name in PEERS if f"{name}, gradient" in names]
+    heads += ["best / ours, forward", "best / ours, gradient"] if peers else []
     rows = []
     for case in cases:
         t = case["timings"]
@@ -225,16 +183,18 @@ def write_report(options: Options, cases: list[dict[str, Any]]) -> str:
             case["edges"],
             *(str(t[n]) for n in names),
         ]
-        if peer:
+        if peers:
             row += [
-                t[f"PyTorch, {part}"].median / t[f"ours, {part}"].median
+                min(t[f"{name}, {part}"].median for name in peers)
+                / t[f"ours, {part}"].median
                 for part in ("forward", "gradient")
             ]
         rows.append(row)
     missing = sorted({name for case in cases for name in case["missing"]})
     return f"""# One Monte Carlo convolution
 
-{options.points} points, {options.channels} channels, depth-wise, kernel perceptron
+A batch of {jax.device_count()} clouds, one for every core, of {options.points} points,
+{options.channels} channels, depth-wise, kernel perceptron
 {INPUTS}-{options.hidden}-{options.hidden}-{options.channels}; "gradient" is forward and
 gradient of all weights and features; edges given; median of {options.repeats} calls ±
 half the interquartile range. Largest relative difference between ours and PyTorch's:

@@ -113,6 +113,11 @@ def everywhere(arrays: Shared) -> Shared:
     return jax.device_put(arrays, NamedSharding(_device_mesh(), PartitionSpec()))
 
 
+def each_its_own(turn: Shared) -> Shared:
+    """The blocks of a turn, each on its device."""
+    return jax.device_put(turn, NamedSharding(_device_mesh(), PartitionSpec(_EACH)))
+
+
 def for_each_block(function: Callable[[Any, Any], Any], shared: Any, turn: Any) -> Any:
     """`function(shared, block)` for the blocks of a turn, one on every device.
 

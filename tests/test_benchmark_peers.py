@@ -53,20 +53,20 @@ def test_mc_conv_without_peers(tmp_path, monkeypatch):
     def absent(*_):
         raise ImportError
 
-    monkeypatch.setattr(mc_conv, "in_torch", absent)
+    monkeypatch.setitem(mc_conv.PEERS, "PyTorch", absent)
+    monkeypatch.setitem(mc_conv.PEERS, "PyTorch, a thread a cloud", absent)
     monkeypatch.setattr(mc_conv, "in_open3d", absent)
     options = mc_conv.Options(tmp_path, points=200, radii=(0.2,), repeats=1)
     metrics = mc_conv.main(options)
-    assert metrics["cases"][0]["missing"][0] == "PyTorch"
+    assert metrics["cases"][0]["missing"][:2] == list(mc_conv.PEERS)
     assert metrics["cases"][0]["edges"] > 200
     assert "PyTorch" in (tmp_path / "report.md").read_text()
 
 
 def test_mc_conv_compares_with_a_peer():
     """A stand-in peer: ours with the blocks of its kernel taken apart."""
-    options = mc_conv.Options(points=200)
     points = mc_conv.uniform(np.random.default_rng(0), 200)
-    mine = mc_conv.ours(mc_conv.make_layer(options, 0.2, points))
+    mine = mc_conv.ours(mc_conv.make_layer([points], 0.2, 24, 16, seed=0))
 
     def flat(wrong=0.0):
         kernel, features = mine["gradient"]()
