@@ -17,7 +17,6 @@ from rich.console import Console
 
 from ginn_jax import evaluate, fit, objects, presets, report, scenes
 from ginn_jax.architecture import Network
-from ginn_jax.checks import number
 from ginn_jax.commandline import require_positive, start
 from ginn_jax.disk_radius import limits_at, with_disk_radius
 from ginn_jax.experiment import (
@@ -56,8 +55,6 @@ class Options(RunOptions):
     """Rays per training point."""
     radius: float = 0.1
     """Occlusion radius, in units of the object's longest side."""
-    hovering: float = 0.0
-    """Share of the training shapes that hover, tilted, over the ground."""
     preset: Literal["default", "paper", "released", "only_2d", "only_3d"] = "default"
     """Layer table: ours, the paper's, the authors' release, or an ablation of ours."""
     resolution: int = 512
@@ -79,7 +76,6 @@ def main(options: Options) -> dict[str, Any]:
     """Run the experiment; returns what metrics.json holds."""
     check_run(options, {"rays": 2, "test_points": 1000})
     require_positive(options, "radius")
-    number("--hovering", options.hovering, 0.0, 1.0)
     console = Console()
     clock = Clock()
     settings = scenes.Occlusion(options.points, options.rays, options.radius)
@@ -115,7 +111,7 @@ def main(options: Options) -> dict[str, Any]:
 def training_sources(options: Options) -> list[objects.Source]:
     """Procedural shapes and the user's meshes."""
     sources = objects.procedural_sources(
-        options.shapes, options.seed * objects.SEEDS_APART, options.hovering
+        options.shapes, options.seed * objects.SEEDS_APART
     )
     if options.meshes is not None:
         sources += objects.file_sources(find_meshes(options.meshes))

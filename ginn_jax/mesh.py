@@ -105,7 +105,7 @@ def fit_unit_box(mesh: Mesh) -> Mesh:
     return mesh._replace(vertices=into_unit_box(mesh.vertices))
 
 
-def add_ground(mesh: Mesh, half_extent: float = 0.8, gap: float = GROUND_GAP) -> Mesh:
+def add_ground(mesh: Mesh, half_extent: float = 0.8) -> Mesh:
     """The mesh and, just below its lowest vertex, a square of material 1 facing +y.
 
     The gap keeps a flat base from lying in the same plane: what starts on either would
@@ -114,7 +114,7 @@ def add_ground(mesh: Mesh, half_extent: float = 0.8, gap: float = GROUND_GAP) ->
     The square is centred at x = z = 0; `half_extent` is half its side.
     """
     half_extent = positive("half_extent", half_extent)
-    low, h = mesh.vertices[:, 1].min() - positive("gap", gap), half_extent
+    low, h = mesh.vertices[:, 1].min() - GROUND_GAP, half_extent
     square = [[-h, low, -h], [-h, low, h], [h, low, h], [h, low, -h]]
     faces = np.array([[0, 1, 2], [0, 2, 3]]) + len(mesh.vertices)
     return Mesh(

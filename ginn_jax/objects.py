@@ -10,7 +10,6 @@ from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
-import trimesh
 
 from ginn_jax.errors import InputError, InputWarning
 from ginn_jax.lighting import (
@@ -20,13 +19,11 @@ from ginn_jax.lighting import (
     procedural_environment,
     turned,
 )
-from ginn_jax.mesh import GROUND_GAP, Mesh, add_ground, fit_unit_box, load_mesh
+from ginn_jax.mesh import Mesh, add_ground, fit_unit_box, load_mesh
 from ginn_jax.shapes import SHAPES, random_shape
 
 # Seeds of what is trained on lie below UNSEEN_SEED, `SEEDS_APART` for each --seed.
 SEEDS_APART, UNSEEN_SEED = 100_000, 10_000_000
-# How high a hovering object is at most, in units of its longest side, and how tilted.
-HIGHEST, MOST_TILTED = 0.1, np.radians(15)
 
 
 @dataclass(frozen=True)
@@ -41,28 +38,19 @@ class LightSource:
 
 @dataclass(frozen=True)
 class Source:
-    """One object: a mesh file, or the seed of a procedural shape; and its light.
-
-    One that `hovers` is over the ground as a jumping one would be.
-    """
+    """One object: a mesh file, or the seed of a procedural shape; and its light."""
 
     name: str
     path: str | None
     seed: int
     light: LightSource | None = None
-    hovers: bool = False
 
 
-def procedural_sources(
-    count: int, first_seed: int, hovering: float = 0.0
-) -> list[Source]:
-    """Procedural shapes of consecutive seeds, of which a share hovers."""
-    sources = []
-    for seed in range(first_seed, first_seed + count):
-        hovers = bool(np.random.default_rng((seed, 8)).random() < hovering)
-        name = f"shape_{seed}__hovering" if hovers else f"shape_{seed}"
-        sources.append(Source(name, None, seed, hovers=hovers))
-    return sources
+def procedural_sources(count: int, first_seed: int) -> list[Source]:
+    """Procedural shapes of consecutive seeds."""
+    return [
+        Source(f"shape_{s}", None, s) for s in range(first_seed, first_seed + count)
+    ]
 
 
 def file_sources(paths: Sequence[Path]) -> list[Source]:
@@ -125,23 +113,7 @@ def load_object(source: Source, ground: bool = True) -> Mesh:
             warnings.simplefilter("ignore", InputWarning)
             mesh = load_mesh(source.path)
     mesh = fit_unit_box(mesh)
-    if not ground:
-        return mesh
-    return over_ground(mesh, source.seed) if source.hovers else add_ground(mesh)
-
-
-def over_ground(mesh: Mesh, seed: int) -> Mesh:
-    """The object a little tilted, in its unit box, somewhat above the ground.
-
-    So are the feet of what walks and jumps, while most objects stand.
-    """
-    rng = np.random.default_rng((seed, 9))
-    towards, tilt = rng.uniform(0, 2 * np.pi), rng.uniform(0, MOST_TILTED)
-    axis = [np.cos(towards), 0.0, np.sin(towards)]
-    turn = trimesh.transformations.rotation_matrix(tilt, axis)
-    tilted = trimesh.transform_points(mesh.vertices, turn).astype(np.float32)
-    gap = rng.uniform(GROUND_GAP, HIGHEST)
-    return add_ground(fit_unit_box(mesh._replace(vertices=tilted)), gap=gap)
+    return add_ground(mesh) if ground else mesh
 
 
 def shape_seed(source: Source) -> int:

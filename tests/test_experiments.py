@@ -77,8 +77,6 @@ def test_mistakes_end_in_one_line_and_code_2(tmp_path):
         {"steps": 0},
         {"radius": float("nan")},
         {"radius": -1.0},
-        {"hovering": -0.5},
-        {"hovering": float("nan")},
         {"start": "no_such_run"},
     ],
 )

@@ -14,7 +14,6 @@ from ginn_jax.objects import (
     file_lights,
     file_sources,
     load_light,
-    load_object,
     origin_of,
     point_lights,
     procedural_lights,
@@ -64,30 +63,6 @@ def test_light_from_a_file_is_turned_by_the_seed(tmp_path):
         columns.add(rolls.index(True))
         np.testing.assert_array_equal(load_light(source).radiance, found)
     assert len(columns) > 6
-
-
-def test_as_many_hover_as_asked():
-    """Over the ground by up to the highest, tilted, in the unit box all the same."""
-    shapes = procedural_sources(200, 0, hovering=0.25)
-    raised = [s for s in shapes if s.hovers]
-    assert 30 < len(raised) < 70
-    assert not any(s.hovers for s in procedural_sources(200, 0))
-    standing = {s.seed: s for s in procedural_sources(200, 0)}
-    for source in raised[:4]:
-        mesh, other = load_object(source), load_object(standing[source.seed])
-        assert origin_of(source) != origin_of(standing[source.seed])
-        places, ground = mesh.vertices[:-4], mesh.vertices[-1, 1]
-        assert 1e-4 <= places[:, 1].min() - ground <= objects.HIGHEST + 1e-6
-        assert np.ptp(places, axis=0).max() == pytest.approx(1, abs=1e-6)
-        cosine = alike(places, other.vertices[:-4])[1, 1]
-        assert np.cos(objects.MOST_TILTED) - 1e-4 < cosine < 1 - 1e-6
-
-
-def alike(to, points):
-    """The matrix, a rotation, that best takes one set of points to the other."""
-    to, points = (np.float64(p - p.mean(axis=0)) for p in (to, points))
-    u, _, v = np.linalg.svd(to.T @ points)
-    return u @ v
 
 
 def test_object_without_light_has_none():
