@@ -4,12 +4,12 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import accumulate
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from ginn_jax.candidates import (
     PACKET,
@@ -21,7 +21,7 @@ from ginn_jax.candidates import (
 from ginn_jax.checks import real_array
 from ginn_jax.errors import InputError
 from ginn_jax.packets import Words, list_bits, packet_words
-from ginn_jax.process import available_cores
+from ginn_jax.process import ALONE, available_cores
 from ginn_jax.voxels import VoxelGrid, build_grid, morton_code
 
 QUERY_BLOCK = 1 << 17
@@ -55,7 +55,7 @@ def find_neighbors(
         InputError: a shape other than [n, 3], a non-finite number, a radius <= 0; or
             numbers whose squares float32 does not hold.
     """
-    points, queries = as_points("points", points), as_points("queries", queries)
+    points, queries = as_points("points", points), as_rows("queries", queries)
     if np.ndim(real_array("radius", radius)) or not 1 / FAR <= radius <= FAR:
         raise InputError(f"radius is {radius}: give a number above 0, 1e-18 to 1e18")
     if not (len(points) and len(queries)):
@@ -68,11 +68,13 @@ def find_neighbors(
     rounding = 2e-6 * radius + 8 * np.finfo(np.float32).eps * np.abs(near_points).max()
     certain, reach = max(radius - 2 * rounding, 0.0), radius + rounding
     shell = np.array([certain, reach], np.float32)
+    # As long as a block: NumPy is slow where it has to repeat three numbers.
+    middle = np.tile(center, min(len(queries), QUERY_BLOCK)).reshape(-1, 3)
 
     def search(first: int) -> list[tuple[Pairs, Int[np.ndarray, "K"]]]:
-        block = queries[first : first + QUERY_BLOCK]
+        block = as_points("queries", queries[first : first + QUERY_BLOCK])
         near = np.empty(block.shape, np.float32)
-        np.subtract(block, center, out=near, casting="same_kind")
+        np.subtract(block, middle[: len(block)], out=near, casting="same_kind")
         found = _search_block(grid, near, shell, first)
         return [_decide(pairs, points, queries, radius) for pairs in found]
 
@@ -81,11 +83,17 @@ def find_neighbors(
         return _join([part for block in blocks for part in block], pool)
 
 
-def as_points(name: str, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-    """The points in float64, or `InputError` if they are not [N, 3] and finite."""
-    points = real_array(name, points).astype(np.float64)
+def as_rows(name: str, points: Any) -> Shaped[np.ndarray, "N 3"]:
+    """The points in their own type, or `InputError` if they are not [N, 3]."""
+    points = real_array(name, points)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"{name} has shape {points.shape}: give an array [N, 3]")
+    return points
+
+
+def as_points(name: str, points: Any) -> Float[np.ndarray, "N 3"]:
+    """The points in float64, or `InputError` if they are not [N, 3] and finite."""
+    points = as_rows(name, points).astype(np.float64, copy=False)
     farthest = max(-points.min(initial=0.0), points.max(initial=0.0))
     if not np.isfinite(farthest):
         raise InputError(f"{name} holds non-finite coordinates: remove those rows")
@@ -192,7 +200,7 @@ def _join(
     return query, point
 
 
-@partial(jax.jit, static_argnames="capacity")
+@partial(jax.jit, static_argnames="capacity", compiler_options=ALONE)
 def _words(
     grid: VoxelGrid,
     query: Float[Array, "M 3"],
@@ -206,7 +214,7 @@ def _words(
     return words, jnp.sum(jax.lax.population_count(words.word).astype(jnp.int32))
 
 
-@partial(jax.jit, static_argnames="capacity")
+@partial(jax.jit, static_argnames="capacity", compiler_options=ALONE)
 def _list(
     grid: VoxelGrid,
     query: Float[Array, "M 3"],
@@ -223,7 +231,9 @@ def _list(
     return first + receiver, grid.index[row], doubtful
 
 
-_build_grid = jax.jit(build_grid)
-_code = jax.jit(morton_code, static_argnums=2)
-_columns = jax.jit(packet_columns)
-_candidates = jax.jit(packet_candidates, static_argnums=(2, 3))
+# Blocks have a thread on every core.
+_jit = partial(jax.jit, compiler_options=ALONE)
+_build_grid = _jit(build_grid)
+_code = _jit(morton_code, static_argnums=2)
+_columns = _jit(packet_columns)
+_candidates = _jit(packet_candidates, static_argnums=(2, 3))

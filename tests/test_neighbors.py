@@ -26,6 +26,7 @@ from ginn_jax import neighbors as nb
 from ginn_jax import packets as pk
 from ginn_jax import voxels as vx
 from ginn_jax.candidates import PACKET
+from ginn_jax.errors import InputError
 
 INT32_MAX = 2**31 - 1
 
@@ -234,3 +235,11 @@ def test_buckets_hold_their_count_and_waste_at_most_half(count):
     assert size >= count
     assert size <= max(64, 1.5 * count)
     assert nb.bucket(size) == size
+
+
+def test_a_query_of_a_later_block_is_looked_at(monkeypatch):
+    monkeypatch.setattr(nb, "QUERY_BLOCK", 64)
+    queries = np.zeros((200, 3))
+    queries[190, 1] = np.nan
+    with pytest.raises(InputError, match="queries holds non-finite"):
+        nb.find_neighbors(np.zeros((5, 3)), queries, 0.1)
