@@ -59,6 +59,7 @@ def find_neighbors(
     if np.ndim(real_array("radius", radius)) or not 1 / FAR <= radius <= FAR:
         raise InputError(f"radius is {radius}: give a number above 0, 1e-18 to 1e18")
     if not (len(points) and len(queries)):
+        as_points("queries", queries)  # refused all the same
         return np.zeros(0, np.int32), np.zeros(0, np.int32)
     center = 0.5 * (points.min(0) + points.max(0))
     near_points = np.asarray(points - center, np.float32)

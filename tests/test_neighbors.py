@@ -241,5 +241,6 @@ def test_a_query_of_a_later_block_is_looked_at(monkeypatch):
     monkeypatch.setattr(nb, "QUERY_BLOCK", 64)
     queries = np.zeros((200, 3))
     queries[190, 1] = np.nan
-    with pytest.raises(InputError, match="queries holds non-finite"):
-        nb.find_neighbors(np.zeros((5, 3)), queries, 0.1)
+    for count in (5, 0):
+        with pytest.raises(InputError, match="queries holds non-finite"):
+            nb.find_neighbors(np.zeros((count, 3)), queries, 0.1)
