@@ -78,6 +78,14 @@ def cheap_compiling():
         yield
 
 
+@pytest.fixture
+def at_once(monkeypatch):
+    """Nothing is warmed up: times are not looked at."""
+    from benchmarks import timing  # after the hook, as above
+
+    monkeypatch.setattr(timing, "WARM", 0.0)
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _forget_compilations():
     """Each module's own: thousands of kernels exhaust the maps a process may have."""

@@ -4,13 +4,9 @@ import numpy as np
 import pytest
 from left_behind import check_files
 
-from benchmarks import mc_conv, neighbors, timing
+from benchmarks import mc_conv, neighbors
 
-
-@pytest.fixture(autouse=True)
-def at_once(monkeypatch):
-    """Times are not looked at."""
-    monkeypatch.setattr(timing, "WARM", 0.0)
+pytestmark = pytest.mark.usefixtures("at_once")
 
 
 def test_pairs_may_differ_at_the_radius_only():

@@ -24,11 +24,7 @@ from ginn_jax.commandline import hasten
 from ginn_jax.disk_radius import with_disk_radius
 from ginn_jax.errors import InputError
 
-
-@pytest.fixture(autouse=True)
-def at_once(monkeypatch):
-    """Times are not looked at."""
-    monkeypatch.setattr(timing, "WARM", 0.0)
+pytestmark = pytest.mark.usefixtures("at_once")
 
 
 def test_quick_keeps_what_the_user_gave():
