@@ -3,6 +3,7 @@
 A pixel is a point: points are shaded, in an order that keeps neighbours together.
 """
 
+from collections.abc import Sequence
 from functools import lru_cache, partial
 from typing import Any
 
@@ -11,11 +12,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ginn_jax.architecture import Network
+from ginn_jax.blocks import fitted_to_blocks
 from ginn_jax.checks import LARGEST, number
 from ginn_jax.errors import InputError
 from ginn_jax.example import numbers_asked
-from ginn_jax.inference import shade_points
-from ginn_jax.limits import Limits, largest
+from ginn_jax.inference import shade_demanding
+from ginn_jax.limits import Demands, Limits
 from ginn_jax.network import Variables
 from ginn_jax.shading import Encoded
 from ginn_jax.upsample import Surface, sampled, shading_step, upsample
@@ -89,19 +91,21 @@ def shade_image(
     channels = () if encoded.scale is None else encoded.scale.shape
     values = np.full((*surface.mask.shape, *channels), background, np.float32)
     shade = partial(_shade_pixels, network, variables, encoded)
+    fit = partial(fitted_to_blocks, lit=encoded.scale is not None)
     if step == 1:
-        return shade(surface, numbers, values, limits)
+        values, sufficed, needed = shade(surface, numbers, values, limits)
+        return values, fit(sufficed, needed, int(surface.mask.sum()))
     places = tuple(sampled(n, step) for n in surface.mask.shape)
     fewer = Surface(*(a[places] for a in surface))
     own = tuple(a if a is None else a[:, *places] for a in numbers)
-    coarse, sufficed = shade(fewer, own, values[places], limits)
+    coarse, sufficed, needed = shade(fewer, own, values[places], limits)
     thickness = np.float32(0.2 * network.query.radius)
     between, known = map(np.asarray, _upsample(coarse, step, surface, thickness))
     np.copyto(values, between, where=known[..., None] if channels else known)
     values[places] = coarse
     rest = surface._replace(mask=surface.mask & ~known)
-    values, more = shade(rest, numbers, values, largest(limits, sufficed))
-    return values, largest(sufficed, more)
+    values, sufficed, more = shade(rest, numbers, values, sufficed)
+    return values, fit(sufficed, [*needed, *more], int(fewer.mask.sum()))
 
 
 def _shade_pixels(
@@ -112,21 +116,26 @@ def _shade_pixels(
     numbers: tuple[Float[np.ndarray, "C H W _"] | None, ...],
     values: Float[np.ndarray, "H W *C"],
     limits: Limits,
-) -> tuple[Float[np.ndarray, "H W *C"], Limits]:
-    """`values` with those of the pixels in the mask; `numbers`: material and light."""
+) -> tuple[Float[np.ndarray, "H W *C"], Limits, Sequence[Demands]]:
+    """`values` with those of the pixels in the mask; `numbers`: material and light.
+
+    Limits that sufficed and demands as of `shade_demanding`.
+    """
     position, normal, mask = surface
     rows = coherent_pixels(position, mask, COARSE * network.query.radius)
     # `take` is three times as fast here as an index.
-    ends = (np.reshape(a, (-1, 3)).take(rows, axis=0) for a in (position, normal))
-    more = (
+    position, normal = (
+        np.reshape(a, (-1, 3)).take(rows, axis=0) for a in (position, normal)
+    )
+    material, light = (
         a if a is None else np.reshape(a, (len(a), mask.size, -1)).take(rows, 1)
         for a in numbers
     )
-    arrays = network, limits, variables, encoded
-    found, limits = shade_points(*arrays, *ends, *more, coherent=True)
+    given = encoded, position, normal, material, light, True
+    found, sufficed, demands = shade_demanding(network, limits, variables, *given)
     values = np.array(values, order="C")
     values.reshape(-1, *values.shape[2:])[rows] = within_range(encoded, found)
-    return values, limits
+    return values, sufficed, demands
 
 
 def check_image(position: Any, normal: Any, mask: Any, background: float) -> None:

@@ -18,10 +18,10 @@ from ginn_jax.blocks import (
     block_size,
     channels_in_turns,
     everywhere,
+    fitted_to_blocks,
     for_each_block,
     in_rows,
     in_turns,
-    largest_block,
     pad_channels,
     pad_points,
 )
@@ -29,11 +29,11 @@ from ginn_jax.checks import channels_alike, numbers_of, unit_rows
 from ginn_jax.dataset import center_of
 from ginn_jax.errors import InputError
 from ginn_jax.example import numbers_asked
+from ginn_jax.levels import check_kept
 from ginn_jax.limits import (
     SLACK,
     Demands,
     Limits,
-    fitted,
     measure_limits,
     only,
     say_raised,
@@ -133,22 +133,8 @@ def encode_cloud(
     measure = partial(cloud_limits, network, cloud, kept_before, key=key)
     encoded, sufficed, _ = with_room(limits, attempt, measure)
     say_raised(limits, sufficed)
-    return encoded._replace(center=center), sufficed
-
-
-def nothing_kept(network: Network, points: int) -> Bool[np.ndarray, "L R"]:
-    """What was kept before the first frame of a cloud of so many points."""
-    return np.zeros((len(network.levels), bucket(points)), bool)
-
-
-def check_kept(kept: Any, shape: tuple[int, int]) -> None:
-    """Raise `InputError` unless these are samples kept of a cloud of that shape."""
-    given = np.zeros(shape, bool) if kept is None else np.asarray(kept)
-    if given.shape != shape or given.dtype != bool:
-        raise InputError(
-            f"kept_before is {given.dtype} {given.shape}, not bool {shape}: give what "
-            "the same network kept of as many points"
-        )
+    # Copied to all devices once, not for every image.
+    return everywhere(encoded)._replace(center=center), sufficed
 
 
 def cloud_limits(
@@ -220,6 +206,24 @@ def shade_points(
     Raises:
         InputError: as `encode_cloud`, but for no points at all, which have no values.
     """
+    ends = encoded, position, normal, material, light, coherent
+    values, sufficed, demands = shade_demanding(network, limits, variables, *ends)
+    lit = encoded.scale is not None
+    return values, fitted_to_blocks(sufficed, demands, len(position), lit)
+
+
+def shade_demanding(
+    network: Network,
+    limits: Limits,
+    variables: Variables,
+    encoded: Encoded,
+    position: Float[np.ndarray, "M 3"],
+    normal: Float[np.ndarray, "M 3"],
+    material: Float[np.ndarray, "C M A"] | None,
+    light: Float[np.ndarray, "C M L"] | None,
+    coherent: bool,
+) -> tuple[Float[np.ndarray, "M *C"], Limits, Sequence[Demands]]:
+    """`shade_points` with what every turn needed, and limits that sufficed for it."""
     unit_rows(position, normal)
     if network.asks == "all":
         numbers_of("material", material, network.materials, len(position))
@@ -233,10 +237,8 @@ def shade_points(
     attempt = partial(_shade_turns, network, variables, encoded, turns, coherent)
     measure = partial(query_limits, network, encoded.searched(), queries, coherent)
     parts, sufficed, demands = with_room(limits, attempt, measure)
-    if 2 * size > largest_block(encoded.scale is not None):  # the next may be larger
-        sufficed = fitted(sufficed, demands)
     say_raised(limits, sufficed)
     channels = () if encoded.scale is None else encoded.scale.shape
-    if not parts:
-        return np.zeros((0, *channels), np.float32), sufficed
-    return in_rows(parts)[: len(position)], sufficed
+    nothing = np.zeros((0, *channels), np.float32)
+    values = in_rows(parts)[: len(position)] if parts else nothing
+    return values, sufficed, demands

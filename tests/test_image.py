@@ -252,14 +252,20 @@ def ground_picture():
     return position, normal, np.abs(x - 0.11) > 0.05
 
 
+def calls_of_shading(monkeypatch, record):
+    """What `record` says of the arguments of every call that shades pixels."""
+    calls, shade_demanding = [], inference.shade_demanding
+
+    def called(*arguments, **options):
+        calls.append(record(*arguments))
+        return shade_demanding(*arguments, **options)
+
+    monkeypatch.setattr(image, "shade_demanding", called)
+    return calls
+
+
 def test_a_lower_rate_computes_fewer_pixels(variables, encoded, monkeypatch):
-    shaded, shade_points = [], inference.shade_points
-
-    def counted(*arguments, **options):
-        shaded.append(len(arguments[4]))
-        return shade_points(*arguments, **options)
-
-    monkeypatch.setattr(image, "shade_points", counted)
+    shaded = calls_of_shading(monkeypatch, lambda *given: len(given[4]))
     position, normal, mask = ground_picture()
     arguments = (tiny.NETWORK, tiny.LIMITS, variables, encoded, position, normal, mask)
     full, _ = image.shade_image(*arguments)
@@ -279,3 +285,22 @@ def test_unusable_resolution_scale_is_refused(variables, encoded, scale):
     arguments = (tiny.NETWORK, tiny.LIMITS, variables, encoded)
     with pytest.raises(InputError, match=r"^resolution scale [^\n]*\Z"):
         image.shade_image(*arguments, *ground_picture(), resolution_scale=scale)
+
+
+def test_a_lower_rate_settles_for_limits_that_fit(variables, encoded, monkeypatch):
+    """Both the coarse pixels and the few others go on in room that fits both."""
+    monkeypatch.setattr(blocks, "BLOCK", 128)
+    given = calls_of_shading(monkeypatch, lambda *arguments: arguments[1])
+    arguments = variables, encoded, *ground_picture()
+    limits, made = tiny.LIMITS, []
+    for _ in range(3):
+        picture, limits = image.shade_image(
+            tiny.NETWORK, limits, *arguments, resolution_scale=0.5
+        )
+        made.append((picture, limits))
+    assert len(given) == 6
+    assert given[:2] == [tiny.LIMITS] * 2
+    assert made[0][1] == made[1][1] == made[2][1]
+    assert made[0][1].of("query.edges") < tiny.LIMITS.of("query.edges")
+    assert given[2:] == [made[0][1]] * 4
+    np.testing.assert_allclose(made[1][0], made[0][0], atol=1e-6)
