@@ -136,7 +136,8 @@ def compare(
     mask = gbuffer.mask
     place, normal = (jnp.asarray(a[mask]) for a in pixels[:2])
     queries = Oriented(place, normal, jnp.ones(len(place), bool))
-    plain = plain_call(network, variables, encoded, queries)
+    alone = jax.device_put(jax.device_get(encoded), jax.devices()[0])
+    plain = plain_call(network, variables, alone, queries)
     expected = image.as_openness(np.asarray(plain()[0]))
     difference = float(np.abs(ours()[mask] - expected).max())
     if difference > 1e-4:

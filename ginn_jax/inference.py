@@ -100,7 +100,7 @@ def encode_cloud(
     *,
     key: Key[Array, ""],
 ) -> tuple[Encoded, Limits]:
-    """Codes of a cloud, and the limits that sufficed.
+    """Codes of a cloud, on all devices, and the limits that sufficed.
 
     In an animation, samples that move with their surface, give what the frame before
     `kept` (`nothing_kept` before the first): levels then change as little as they can,
@@ -133,8 +133,9 @@ def encode_cloud(
     measure = partial(cloud_limits, network, cloud, kept_before, key=key)
     encoded, sufficed, _ = with_room(limits, attempt, measure)
     say_raised(limits, sufficed)
-    # Copied to all devices once, not for every image.
-    return everywhere(encoded)._replace(center=center), sufficed
+    # What f_2D needs is copied to all devices once, not for every image.
+    shared = everywhere(encoded._replace(kept=None))
+    return shared._replace(center=center, kept=encoded.kept), sufficed
 
 
 def cloud_limits(

@@ -30,8 +30,10 @@ assert inference.shade_turn._cache_size() == 1
 
 ends = variables, cloud.position, cloud.normal, *network_numbers(cloud)
 encoded, _ = inference.encode_cloud(network, limits, *ends, key=cases.KEY)
-codes = jax.tree.leaves(encoded._replace(center=None))
+codes = jax.tree.leaves(encoded._replace(center=None, kept=None))
 assert all(len(a.devices()) == 2 for a in codes)
+# The next frame's f_3D runs where this lies: on one.
+assert len(encoded.kept.devices()) == 1
 one = blocks.pad_points(encoded.center, queries.position, queries.normal, 700)
 numbers = map(np.asarray, network_numbers(queries))
 shade = jax.jit(shading.shade, static_argnums=(0, 1))
