@@ -14,7 +14,6 @@ from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Float
 
 from ginn_jax.dataset import relative_to
-from ginn_jax.limits import Demands, Limits, fitted
 from ginn_jax.neighbors import bucket, pad_rows
 from ginn_jax.receptive_field import Oriented
 
@@ -42,15 +41,6 @@ def block_size(points: int, lit: bool) -> int:
     most = largest_block(lit)
     turns = -(-points // (most * jax.device_count()))
     return min(most, bucket(-(-points // max(turns * jax.device_count(), 1))))
-
-
-def fitted_to_blocks(
-    limits: Limits, demands: Sequence[Demands], points: int, lit: bool
-) -> Limits:
-    """Limits that fit these demands, unless blocks of so many points are small ones:
-    the next may be larger."""
-    full = 2 * block_size(points, lit) > largest_block(lit)
-    return fitted(limits, demands) if full else limits
 
 
 def pad_points(

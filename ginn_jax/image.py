@@ -3,7 +3,6 @@
 A pixel is a point: points are shaded, in an order that keeps neighbours together.
 """
 
-from collections.abc import Sequence
 from functools import lru_cache, partial
 from typing import Any
 
@@ -12,20 +11,26 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ginn_jax.architecture import Network
-from ginn_jax.blocks import fitted_to_blocks
 from ginn_jax.checks import LARGEST, number
 from ginn_jax.errors import InputError
 from ginn_jax.example import numbers_asked
-from ginn_jax.inference import shade_demanding
-from ginn_jax.limits import Demands, Limits
+from ginn_jax.inference import shade_points
+from ginn_jax.limits import Limits
 from ginn_jax.network import Variables
 from ginn_jax.shading import Encoded
-from ginn_jax.upsample import Surface, sampled, shading_step, upsample
+from ginn_jax.upsample import (
+    Surface,
+    blend,
+    blend_between,
+    sampled,
+    shading_step,
+)
 
 # Cells of space that pixels are sorted into, in radii of f_2D.
 COARSE = 4.0
 
-_upsample = jax.jit(upsample, static_argnums=1)
+_blend_between = jax.jit(blend_between, static_argnums=0)
+_blend = jax.jit(blend, static_argnums=1)
 
 
 @lru_cache(maxsize=8)
@@ -72,7 +77,8 @@ def shade_image(
     """An image; only the pixels in `mask` are computed. With light, one a channel.
 
     At a `resolution_scale` of 1/2, 1/3 or 1/4 fewer are: the others are interpolated
-    inside their own surface, and computed where that is not possible (see `upsample`).
+    inside their own surface, or computed as well where that is not possible (see
+    `upsample`).
 
     Raises:
         InputError: another resolution scale, arrays of unequal size, a mask that is not
@@ -88,39 +94,31 @@ def shade_image(
                 f"{name} {np.shape(given)} does not fit the mask {surface.mask.shape}: "
                 "give [C H W numbers]"
             )
-    channels = () if encoded.scale is None else encoded.scale.shape
-    values = np.full((*surface.mask.shape, *channels), background, np.float32)
-    shade = partial(_shade_pixels, network, variables, encoded)
-    fit = partial(fitted_to_blocks, lit=encoded.scale is not None)
+    shade = partial(_shade_pixels, network, limits, variables, encoded, background)
     if step == 1:
-        values, sufficed, needed = shade(surface, numbers, values, limits)
-        return values, fit(sufficed, needed, int(surface.mask.sum()))
-    places = tuple(sampled(n, step) for n in surface.mask.shape)
-    fewer = Surface(*(a[places] for a in surface))
-    own = tuple(a if a is None else a[:, *places] for a in numbers)
-    coarse, sufficed, needed = shade(fewer, own, values[places], limits)
+        return shade(surface, numbers)
     thickness = np.float32(0.2 * network.query.radius)
-    between, known = map(np.asarray, _upsample(coarse, step, surface, thickness))
-    np.copyto(values, between, where=known[..., None] if channels else known)
-    values[places] = coarse
-    rest = surface._replace(mask=surface.mask & ~known)
-    values, sufficed, more = shade(rest, numbers, values, sufficed)
-    return values, fit(sufficed, [*needed, *more], int(fewer.mask.sum()))
+    taken = _blend_between(step, surface, thickness)
+    places = tuple(sampled(n, step) for n in surface.mask.shape)
+    between = np.array(taken.known)
+    between[places] = False
+    values, sufficed = shade(surface._replace(mask=surface.mask & ~between), numbers)
+    blended = np.asarray(_blend(values[places], step, taken))
+    where = between.reshape(between.shape + (1,) * (values.ndim - 2))
+    np.copyto(values, blended, where=where)
+    return values, sufficed
 
 
 def _shade_pixels(
     network: Network,
+    limits: Limits,
     variables: Variables,
     encoded: Encoded,
+    background: float,
     surface: Surface,
     numbers: tuple[Float[np.ndarray, "C H W _"] | None, ...],
-    values: Float[np.ndarray, "H W *C"],
-    limits: Limits,
-) -> tuple[Float[np.ndarray, "H W *C"], Limits, Sequence[Demands]]:
-    """`values` with those of the pixels in the mask; `numbers`: material and light.
-
-    Limits that sufficed and demands as of `shade_demanding`.
-    """
+) -> tuple[Float[np.ndarray, "H W *C"], Limits]:
+    """Values of the pixels in the mask; `numbers`: material and light."""
     position, normal, mask = surface
     rows = coherent_pixels(position, mask, COARSE * network.query.radius)
     # `take` is three times as fast here as an index.
@@ -132,10 +130,10 @@ def _shade_pixels(
         for a in numbers
     )
     given = encoded, position, normal, material, light, True
-    found, sufficed, demands = shade_demanding(network, limits, variables, *given)
-    values = np.array(values, order="C")
-    values.reshape(-1, *values.shape[2:])[rows] = within_range(encoded, found)
-    return values, sufficed, demands
+    found, limits = shade_points(network, limits, variables, *given)
+    values = np.full((mask.size, *found.shape[1:]), background, np.float32)
+    values[rows] = within_range(encoded, found)
+    return values.reshape(*mask.shape, *found.shape[1:]), limits
 
 
 def check_image(position: Any, normal: Any, mask: Any, background: float) -> None:

@@ -18,10 +18,10 @@ from ginn_jax.blocks import (
     block_size,
     channels_in_turns,
     everywhere,
-    fitted_to_blocks,
     for_each_block,
     in_rows,
     in_turns,
+    largest_block,
     pad_channels,
     pad_points,
 )
@@ -34,6 +34,7 @@ from ginn_jax.limits import (
     SLACK,
     Demands,
     Limits,
+    fitted,
     measure_limits,
     only,
     say_raised,
@@ -207,24 +208,6 @@ def shade_points(
     Raises:
         InputError: as `encode_cloud`, but for no points at all, which have no values.
     """
-    ends = encoded, position, normal, material, light, coherent
-    values, sufficed, demands = shade_demanding(network, limits, variables, *ends)
-    lit = encoded.scale is not None
-    return values, fitted_to_blocks(sufficed, demands, len(position), lit)
-
-
-def shade_demanding(
-    network: Network,
-    limits: Limits,
-    variables: Variables,
-    encoded: Encoded,
-    position: Float[np.ndarray, "M 3"],
-    normal: Float[np.ndarray, "M 3"],
-    material: Float[np.ndarray, "C M A"] | None,
-    light: Float[np.ndarray, "C M L"] | None,
-    coherent: bool,
-) -> tuple[Float[np.ndarray, "M *C"], Limits, Sequence[Demands]]:
-    """`shade_points` with what every turn needed, and limits that sufficed for it."""
     unit_rows(position, normal)
     if network.asks == "all":
         numbers_of("material", material, network.materials, len(position))
@@ -238,8 +221,10 @@ def shade_demanding(
     attempt = partial(_shade_turns, network, variables, encoded, turns, coherent)
     measure = partial(query_limits, network, encoded.searched(), queries, coherent)
     parts, sufficed, demands = with_room(limits, attempt, measure)
+    if 2 * size > largest_block(encoded.scale is not None):  # the next may be larger
+        sufficed = fitted(sufficed, demands)
     say_raised(limits, sufficed)
     channels = () if encoded.scale is None else encoded.scale.shape
-    nothing = np.zeros((0, *channels), np.float32)
-    values = in_rows(parts)[: len(position)] if parts else nothing
-    return values, sufficed, demands
+    if not parts:
+        return np.zeros((0, *channels), np.float32), sufficed
+    return in_rows(parts)[: len(position)], sufficed

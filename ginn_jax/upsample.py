@@ -3,16 +3,19 @@
 Only every so manieth pixel is shaded. A pixel in between takes the mean of the four
 shaded ones around it, weighted by how well they lie in its own surface, so no value
 crosses an edge of depth or normal. Where none of them does, the pixel has no value and
-has to be shaded itself: borders neither darken nor bleed.
+has to be shaded itself: borders neither darken nor bleed. Which ones those are says the
+geometry alone, so they are shaded together with the samples.
 
 Pixels that lie alike between the shaded ones are taken together, as a smaller image:
 what is done is then done to whole images side by side, without an index.
 """
 
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Shaped
 
 from ginn_jax.errors import InputError
@@ -21,7 +24,8 @@ SHARPNESS = 8
 LEAST_WEIGHT = 0.05
 COARSEST = 4
 
-Ends = list[tuple[slice, float]]
+Part = tuple[slice, ...]
+Ends = list[tuple[Part, float]]
 
 
 class Surface(NamedTuple):
@@ -30,6 +34,17 @@ class Surface(NamedTuple):
     position: Float[Any, "H W 3"]
     normal: Float[Any, "H W 3"]
     mask: Bool[Any, "H W"]
+
+
+class Blend(NamedTuple):
+    """How pixels are made of samples around them.
+
+    `weights` are by place between the samples, and there by sample: what it counts for
+    each pixel that lies so. `known` are the pixels whose samples count enough.
+    """
+
+    weights: tuple[tuple[Float[Any, "_ _"], ...], ...]
+    known: Bool[Any, "H W"]
 
 
 def shading_step(scale: float) -> int:
@@ -52,34 +67,65 @@ def sampled(size: int, step: int) -> slice:
     return slice(min(step // 2, size - 1), size, step)
 
 
-def upsample(
-    values: Float[Array, "h w *C"],
-    step: int,
-    surface: Surface,
-    thickness: Float[Array, ""],
-) -> tuple[Float[Array, "H W *C"], Bool[Array, "H W"]]:
-    """Values of all pixels from those `sampled` at a step, and which have one.
+def blend_between(step: int, surface: Surface, thickness: Float[Array, ""]) -> Blend:
+    """What pixels take of those `sampled` at a step.
 
     `thickness` is how far a sample may lie off a pixel's tangent plane, as a standard
-    deviation in units of length. Values where there is none are 0.
+    deviation in units of length.
     """
     shape = surface.mask.shape
     places = tuple(sampled(n, step) for n in shape)
     samples = Surface(*(_beyond_borders(a[places]) for a in surface))
+    weights, known = [], []
+    for here, around in _alike(step, shape):
+        pixels = Surface(*(a[here] for a in surface))
+        parts = tuple(
+            share * _likeness(pixels, Surface(*(a[there] for a in samples)), thickness)
+            for there, share in around
+        )
+        # Or XLA works them out once more for their sum.
+        parts = jax.lax.optimization_barrier(parts)
+        weights.append(parts)
+        known.append(_enough(sum(parts))[..., None])
+    return Blend(tuple(weights), _interleaved(known, step, shape)[..., 0])
+
+
+def blend(
+    values: Float[Array, "h w *C"], step: int, taken: Blend
+) -> Float[Array, "H W *C"]:
+    """Values of all pixels from those `sampled` at a step; 0 where there is none."""
+    shape = taken.known.shape
     lights = values.reshape(*values.shape[:2], -1)
     lights = [_beyond_borders(lights[..., c]) for c in range(lights.shape[2])]
     parts = []
-    for row in range(step):
-        for column in range(step):
-            here = Surface(*(a[row::step, column::step] for a in surface))
-            above = _around(row, places[0].start, step, shape[0])
-            left = _around(column, places[1].start, step, shape[1])
-            parts.append(_between(here, samples, lights, above, left, thickness))
-    found, known = (_interleaved(p, step, shape) for p in zip(*parts, strict=True))
-    return found.reshape(*shape, *values.shape[2:]), known[..., 0]
+    for (_, around), weights in zip(_alike(step, shape), taken.weights, strict=True):
+        total = sum(weights)
+        inverse = jnp.where(_enough(total), 1 / jnp.maximum(total, LEAST_WEIGHT), 0.0)
+        pairs = list(zip(weights, (there for there, _ in around), strict=True))
+        made = [inverse * sum(w * light[i] for w, i in pairs) for light in lights]
+        parts.append(jnp.stack(made, -1))
+    found = _interleaved(parts, step, shape)
+    return found.reshape(*shape, *values.shape[2:])
 
 
-def _around(place: int, start: int, step: int, size: int) -> Ends:
+def _enough(weight: Any) -> Bool[Array, "H W"]:
+    """Where samples weigh enough to say what a pixel is."""
+    return weight > LEAST_WEIGHT
+
+
+def _alike(step: int, shape: tuple[int, ...]) -> Iterator[tuple[Part, Ends]]:
+    """Pixels that lie alike between their samples, as a part of the image; and those.
+
+    Samples as parts of all `_beyond_borders`, each with its share.
+    """
+    starts = [sampled(n, step).start for n in shape]
+    for place in np.ndindex(step, step):
+        above, left = map(_around, place, starts, (step, step), shape)
+        ends = [((i, j), a * b) for i, a in above for j, b in left]
+        yield tuple(slice(first, None, step) for first in place), ends
+
+
+def _around(place: int, start: int, step: int, size: int) -> list[tuple[slice, float]]:
     """The samples before and after the pixels of a row from `place` on, every `step`.
 
     As slices of the samples `_beyond_borders`, each with its share; none without one.
@@ -97,30 +143,8 @@ def _beyond_borders(samples: Shaped[Array, "h w *C"]) -> Shaped[Array, "n m *C"]
     return jax.lax.optimization_barrier(jnp.pad(samples, around, mode="edge"))
 
 
-def _between(
-    here: Surface,
-    samples: Surface,
-    lights: list[Float[Array, "n m"]],
-    above: Ends,
-    left: Ends,
-    thickness: Float[Array, ""],
-) -> tuple[Float[Array, "H W C"], Bool[Array, "H W 1"]]:
-    """Values of pixels that all lie alike between their samples."""
-    total, weight = [jnp.float32(0)] * len(lights), jnp.float32(0)
-    for rows, share_i in above:
-        for columns, share_j in left:
-            there = Surface(*(a[rows, columns] for a in samples))
-            like = share_i * share_j * _likeness(here, there, thickness)
-            pairs = zip(total, lights, strict=True)
-            total = [t + like * light[rows, columns] for t, light in pairs]
-            weight += like
-    known = here.mask & (weight > LEAST_WEIGHT)
-    inverse = jnp.where(known, 1 / jnp.where(known, weight, 1.0), 0.0)
-    return jnp.stack([t * inverse for t in total], axis=-1), known[..., None]
-
-
 def _interleaved(
-    parts: tuple[Shaped[Array, "..."], ...], step: int, shape: tuple[int, int]
+    parts: Sequence[Shaped[Array, "..."]], step: int, shape: tuple[int, ...]
 ) -> Shaped[Array, "H W C"]:
     """One image of those of which each has every so manieth pixel."""
     high, wide = (-(-n // step) for n in shape)

@@ -1,5 +1,7 @@
 """Shading at a lower rate: what upsampling must keep, and where it must say no."""
 
+from functools import partial
+
 import jax
 import numpy as np
 import pytest
@@ -7,10 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from ginn_jax.upsample import COARSEST, Surface, sampled, shading_step, upsample
+from ginn_jax.upsample import (
+    COARSEST,
+    Surface,
+    blend,
+    blend_between,
+    sampled,
+    shading_step,
+)
 
 SIZE = 16
-lift = jax.jit(upsample, static_argnums=1)
 UP = np.array([0.0, 1, 0], np.float32)
 
 
@@ -19,6 +27,12 @@ def plane(height=0.0, normal=UP):
     x, z = np.meshgrid(*[0.01 * np.arange(SIZE, dtype=np.float32)] * 2)
     position = np.stack([x, np.full_like(x, height), z], axis=-1)
     return Surface(position, np.broadcast_to(normal, position.shape), x >= 0)
+
+
+@partial(jax.jit, static_argnums=1)
+def lift(values, step, surface, thickness):
+    taken = blend_between(step, surface, thickness)
+    return blend(values, step, taken), taken.known
 
 
 def lifted(values, step, surface, thickness=0.005):
