@@ -9,8 +9,7 @@ from ginn_jax.compare_networks import Trained, redrawn
 from ginn_jax.dataset import ShadedPoints
 from ginn_jax.evaluate_light import LitView, channels_of, encode_lit
 from ginn_jax.image import within_range
-from ginn_jax.inference import encode_cloud, shade_points
-from ginn_jax.levels import nothing_kept
+from ginn_jax.inference import encode_cloud, nothing_kept, shade_points
 from ginn_jax.lit_clouds import LitCloud, network_numbers
 
 

@@ -29,7 +29,6 @@ from ginn_jax.checks import channels_alike, numbers_of, unit_rows
 from ginn_jax.dataset import center_of
 from ginn_jax.errors import InputError
 from ginn_jax.example import numbers_asked
-from ginn_jax.levels import check_kept
 from ginn_jax.limits import (
     SLACK,
     Demands,
@@ -137,6 +136,21 @@ def encode_cloud(
     # What f_2D needs is copied to all devices once, not for every image.
     shared = everywhere(encoded._replace(kept=None))
     return shared._replace(center=center, kept=encoded.kept), sufficed
+
+
+def nothing_kept(network: Network, points: int) -> Bool[np.ndarray, "L R"]:
+    """What was kept before the first frame of a cloud of so many points."""
+    return np.zeros((len(network.levels), bucket(points)), bool)
+
+
+def check_kept(kept: Any, shape: tuple[int, int]) -> None:
+    """Raise `InputError` unless these are samples kept of a cloud of that shape."""
+    given = np.zeros(shape, bool) if kept is None else np.asarray(kept)
+    if given.shape != shape or given.dtype != bool:
+        raise InputError(
+            f"kept_before is {given.dtype} {given.shape}, not bool {shape}: give what "
+            "the same network kept of as many points"
+        )
 
 
 def cloud_limits(

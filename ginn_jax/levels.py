@@ -7,18 +7,15 @@ change does not flicker.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from ginn_jax.architecture import Network
-from ginn_jax.errors import InputError
 from ginn_jax.hierarchy import Level, build_level, choose_among, draw_lots, sample_disk
 from ginn_jax.limits import Demands, Limits
-from ginn_jax.neighbors import bucket
 from ginn_jax.packets import Edges
 from ginn_jax.receptive_field import Oriented
 from ginn_jax.searches import search, search_demands, search_limit, shared_search
@@ -141,18 +138,3 @@ def with_normals(
         found = jnp.where(level.mask[:, None], turned[-1].normal[index], 0.0)
         turned.append(level._replace(normal=found))
     return tuple(turned)
-
-
-def nothing_kept(network: Network, points: int) -> Bool[np.ndarray, "L R"]:
-    """What was kept before the first frame of a cloud of so many points."""
-    return np.zeros((len(network.levels), bucket(points)), bool)
-
-
-def check_kept(kept: Any, shape: tuple[int, int]) -> None:
-    """Raise `InputError` unless these are samples kept of a cloud of that shape."""
-    given = np.zeros(shape, bool) if kept is None else np.asarray(kept)
-    if given.shape != shape or given.dtype != bool:
-        raise InputError(
-            f"kept_before is {given.dtype} {given.shape}, not bool {shape}: give what "
-            "the same network kept of as many points"
-        )

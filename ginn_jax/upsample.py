@@ -11,11 +11,11 @@ what is done is then done to whole images side by side, without an index.
 """
 
 from collections.abc import Iterator, Sequence
+from itertools import product
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Shaped
 
 from ginn_jax.errors import InputError
@@ -119,7 +119,7 @@ def _alike(step: int, shape: tuple[int, ...]) -> Iterator[tuple[Part, Ends]]:
     Samples as parts of all `_beyond_borders`, each with its share.
     """
     starts = [sampled(n, step).start for n in shape]
-    for place in np.ndindex(step, step):
+    for place in product(range(step), repeat=2):
         above, left = map(_around, place, starts, (step, step), shape)
         ends = [((i, j), a * b) for i, a in above for j, b in left]
         yield tuple(slice(first, None, step) for first in place), ends

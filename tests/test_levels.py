@@ -154,7 +154,7 @@ def test_an_encoding_takes_what_the_one_before_kept():
         )
         return made
 
-    nothing = levels.nothing_kept(tiny.NETWORK, 1000)
+    nothing = inference.nothing_kept(tiny.NETWORK, 1000)
     first = encode(nothing, one)
     assert first.kept is not None
     np.testing.assert_array_equal(first.kept, encode(None, one).kept)

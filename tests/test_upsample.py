@@ -5,10 +5,13 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
+import tiny
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from ginn_jax import image
+from ginn_jax.shading import Encoded
 from ginn_jax.upsample import (
     COARSEST,
     Surface,
@@ -160,3 +163,27 @@ def test_a_pixel_of_no_sample_is_left_to_be_shaded():
     assert not known[:, bar].any()
     assert known[:, ~bar].all()
     assert (found[:, bar] == 0).all()
+
+
+def test_colours_are_interpolated_each_by_itself(monkeypatch):
+    """A ramp for every colour, one of another slope than the other."""
+    slopes = np.array([[0.1, 0.2, 0.3], [0, 0, 0], [0.3, 0.1, -0.2]], np.float32)
+
+    def shade_points(network, limits, variables, encoded, position, *others):
+        return 1 + position @ slopes, limits
+
+    monkeypatch.setattr(image, "shade_points", shade_points)
+    encoded = Encoded(None, None, None, None, np.ones(3, np.float32))  # type: ignore
+    mask = np.arange(SIZE)[None, :] + np.zeros((SIZE, 1)) != 9
+    position, normal, _ = plane()
+    for scale in (1 / 2, 1 / 3):
+        found, _ = image.shade_image(
+            *(tiny.NETWORK, tiny.LIMITS, {}, encoded, position, normal, mask),
+            background=7.0,
+            resolution_scale=scale,
+        )
+        assert (found[~mask] == 7).all()
+        # A pixel is .01 wide; at borders the nearest sample counts alone.
+        wrong = np.abs(found - 1 - position @ slopes)[mask]
+        assert wrong.max() < 0.01 * 0.4 / scale
+        assert np.median(wrong) < 1e-6
