@@ -1,5 +1,6 @@
 """Every test runs with the library's annotations checked and no silent promotion."""
 
+import gc
 import os
 
 # XLA says of every compiled function that it finds in the cache that it may not fit.
@@ -12,6 +13,9 @@ from jaxtyping import config, install_import_hook
 
 install_import_hook("ginn_jax", "beartype.beartype")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+# Tracing makes a great many objects that stay, through all of which each collection goes.
+gc.set_threshold(100_000, 20, 20)
 
 settings.register_profile(
     "ginn_jax", deadline=None, max_examples=25, derandomize="CI" in os.environ

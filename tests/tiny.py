@@ -99,17 +99,24 @@ def _initial_state(config, limits):
         return jax.tree.map(np.array, train.init_state(config))
 
 
+# XLA's older way to emit kernels, all into one module: no thread waits for it.
+SIMPLE = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_cpu_parallel_codegen_split_count": 1,
+}
+
+
 @contextmanager
 def cheap_compiling():
     """Compilation at a third of the time, for what runs a few times only.
 
-    JAX has no setting for XLA's older and simpler way to emit kernels.
+    JAX has no setting for what is in `SIMPLE`.
     """
     given = compiler.get_compile_options
 
     def simple(*args, **options):
         overrides = options.get("env_options_overrides") or {}
-        overrides = {"xla_cpu_use_fusion_emitters": False} | overrides
+        overrides = SIMPLE | overrides
         return given(*args, **options | {"env_options_overrides": overrides})
 
     before = jax.config.values["jax_disable_most_optimizations"]
