@@ -14,7 +14,7 @@ from jaxtyping import config, install_import_hook
 install_import_hook("ginn_jax", "beartype.beartype")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-# Tracing makes a great many objects that stay, through all of which each collection goes.
+# Tracing makes many objects that stay, through all of which each collection goes.
 gc.set_threshold(100_000, 20, 20)
 
 settings.register_profile(
