@@ -281,3 +281,17 @@ def test_unusable_resolution_scale_is_refused(variables, encoded, scale):
     arguments = (tiny.NETWORK, tiny.LIMITS, variables, encoded)
     with pytest.raises(InputError, match=r"^resolution scale [^\n]*\Z"):
         image.shade_image(*arguments, *ground_picture(), resolution_scale=scale)
+
+
+def test_a_lower_rate_settles_for_limits_that_fit(variables, encoded, monkeypatch):
+    """The next image goes on in them, and they stay."""
+    monkeypatch.setattr(blocks, "BLOCK", 128)
+    arguments = variables, encoded, *ground_picture()
+    limits, made = tiny.LIMITS, []
+    for _ in range(2):
+        given = tiny.NETWORK, limits, *arguments
+        picture, limits = image.shade_image(*given, resolution_scale=0.5)
+        made.append((picture, limits))
+    assert made[0][1] == made[1][1]
+    assert limits.of("query.edges") < tiny.LIMITS.of("query.edges")
+    np.testing.assert_allclose(made[1][0], made[0][0], atol=1e-6)
