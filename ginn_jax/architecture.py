@@ -8,6 +8,8 @@ from ginn_jax.errors import InputError
 
 QUERY = -1
 WIDEST = 4096
+# Layers and searches that are no convolution's.
+TAKEN = ("latent", "latent_light", "area", "facets")
 
 
 @dataclass(frozen=True)
@@ -18,8 +20,10 @@ class Conv:
     activate; "dense" the same, then a 1x1 layer to `channels`, then the same again;
     "lift" a 1x1 layer to `channels`, then normalise and activate. A convolution that
     `mixes` has a kernel for every pair of input and output channels, the others one for
-    each channel. `skip` names the convolution whose output (with its own skip) is
-    concatenated in front.
+    each channel. `channels` is the width after "dense" or "lift", or what a convolution
+    that `mixes` puts out; otherwise the input's width is kept. `bandwidth`, in radii,
+    is that of the density estimate "kde". `skip` names the convolution whose output
+    (with its own skip) is concatenated in front.
     """
 
     name: str
@@ -99,10 +103,10 @@ class Network:
 
     def __post_init__(self) -> None:
         """Raise `InputError` for what is no network, wherever it was read."""
-        if not self.levels or list(self.levels) != sorted(self.levels):
-            raise InputError(f"levels {self.levels}: give at least one, finest first")
         for radius in self.levels:
             positive("level", radius)
+        if not self.levels or list(self.levels) != sorted(self.levels):
+            raise InputError(f"levels {self.levels}: give at least one, finest first")
         for name, least in (("latent", 1), ("head", 1), ("hidden", 1), ("group", 0)):
             whole(name, getattr(self, name), least, WIDEST)
         for name in ("materials", "lights", "beams"):
@@ -121,9 +125,13 @@ class Network:
             raise InputError("a network that splats cannot be linear: choose one")
         if (self.linear or self.materials) and not self.lights:
             raise InputError("networks that are linear or take materials take light")
+        if (self.local or self.beams) and not self.lights:
+            raise InputError("a network without lights has none on a linear path")
         for conv in (*self.encoder, self.query):
             if conv.mixes and (self.linear or self.beams):
                 raise InputError(f"{conv.name} mixes, but light passes it by itself")
+        if self.query.mixes and self.local:
+            raise InputError("f_2D mixes, but light near a query passes it by itself")
 
     def _check_chain(self) -> None:
         """Raise `InputError` unless each convolution begins where the last one ends."""
@@ -143,6 +151,8 @@ class Network:
                 one_of(f"skip of {name}", conv.skip, tuple(alike))
             if name in targets:
                 raise InputError(f"two convolutions are called {name}: rename one")
+            if name in TAKEN or "." in name or name.startswith("level_"):
+                raise InputError(f"no convolution can be called {name}: rename it")
             if self.density == "surface" and level > 0 and level not in within:
                 raise InputError(f"no convolution within level {level} gives its areas")
             level = targets[name] = conv.target

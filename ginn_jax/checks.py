@@ -1,6 +1,7 @@
 """What public functions ask of their arguments, once, at the door.
 
-Each returns what it was given, in the type to go on with, or raises `InputError`.
+Each raises `InputError` for anything else; those of one argument return it, in the
+type to go on with.
 """
 
 from typing import Any
@@ -23,6 +24,12 @@ def real_array(name: str, value: Any) -> np.ndarray:
     if not np.can_cast(array.dtype, np.float64, "same_kind"):
         raise InputError(f"{name} holds {array.dtype}: give real numbers, as float32")
     return array
+
+
+def _wide(array: np.ndarray) -> np.ndarray:
+    """In float64 where squares and bounds do not fit its own type."""
+    fits = array.dtype.kind == "f" and array.dtype.itemsize >= 4
+    return array if fits else array.astype(np.float64)
 
 
 def whole(name: str, value: Any, least: int, most: int) -> int:
@@ -73,7 +80,8 @@ def unit_rows(points: Any, normals: Any, what: str = "points") -> None:
         raise InputError(
             f"{what} {points.shape} and normals {normals.shape} must both be [N, 3]"
         )
-    if not np.all(np.abs(points) <= LARGEST):
+    normals = _wide(normals)
+    if not np.all(np.abs(_wide(points)) <= LARGEST):
         raise InputError(f"{what} holds non-finite numbers: drop those rows")
     if not np.all(np.abs(np.einsum("ij,ij->i", normals, normals) - 1) < 2e-3):
         raise InputError(
@@ -87,7 +95,7 @@ def numbers_of(
     """So many finite numbers for each of these points, in channels; None for none."""
     if width == 0 and value is not None:
         raise InputError(f"the network takes no {name}: leave it out")
-    array = real_array(name, () if value is None else value)
+    array = _wide(real_array(name, () if value is None else value))
     shape = array.shape
     if width and (len(shape) != 3 or shape[1:] != (rows, width) or not shape[0]):
         raise InputError(f"{name} is {shape}, the network takes [C {rows} {width}]")

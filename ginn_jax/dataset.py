@@ -155,8 +155,8 @@ def center_of(position: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "3"]:
 
 
 def relative_to(
-    center: Float[Any, "3"] | None, position: Float[np.ndarray, "N 3"]
-) -> Float[np.ndarray, "N 3"]:
+    center: Float[Any, "3"] | None, position: Float[np.ndarray, "*N 3"]
+) -> Float[np.ndarray, "*N 3"]:
     """Coordinates counted from there, the difference taken in float64."""
     position = np.asarray(position)
     if center is None or (position.dtype == np.float32 and not np.any(center)):

@@ -133,8 +133,6 @@ def train(
 ) -> fit.Fit:
     """`fit.fit` with a progress bar, or a line every 100 steps where none can be.
 
-    What was reported of an earlier run there is removed: it is of other weights.
-
     Raises:
         InputError: as `fit.fit`; weights to start from that are of another network.
     """
@@ -142,8 +140,6 @@ def train(
     if options.start is not None:
         weights = starting_weights(options.start, config)
     extra = extra | {"start": options.start}
-    for name in report.RESULTS:
-        (options.out / name).unlink(missing_ok=True)
     with bar(console) as progress:
         task = progress.add_task("training", total=config.steps, note="compiling")
 

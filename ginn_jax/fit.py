@@ -42,7 +42,7 @@ class Schedule:
 class Fit(NamedTuple):
     """A finished run: state, capacities, loss of every step, seconds by purpose.
 
-    Losses and seconds are of the whole run, however often it was resumed.
+    Losses, seconds and what was raised are of the whole run, however often resumed.
     """
 
     state: TrainState
@@ -77,14 +77,14 @@ def fit(
     folder.mkdir(parents=True, exist_ok=True)
     begin, extra = time.perf_counter(), extra or {}
     if resume:
-        room, seconds = load_run(folder, config, extra)
+        room, seconds, raised = load_run(folder, config, extra)
     else:
-        room, seconds = training_room(config, clouds), dict(UNSPENT)
+        room, seconds, raised = training_room(config, clouds), dict(UNSPENT), {}
         save_run(folder, config, room, extra, seconds)
     manager = open_manager(folder, fresh=not resume)
     state, history = latest(manager, folder, init_state(config, weights), resume)
     seconds["compile"] += time.perf_counter() - begin
-    compiled, raised = set[Limits](), dict[str, int]()
+    compiled = set[Limits]()
     while (step := int(state.step)) < config.steps:
         begin = time.perf_counter()
         state, loss, used, wider = step_with_room(config, room, clouds, state)
@@ -103,7 +103,7 @@ def fit(
             progress(step + 1, recent_loss(history, schedule.report), "")
         if (step + 1) % schedule.save == 0 or step + 1 == config.steps:
             save_losses(folder, history)
-            save_run(folder, config, room, extra, seconds)
+            save_run(folder, config, room, extra, seconds, raised)
             save_state(manager, state)
     finish(manager)
     return Fit(state, room.usual, np.array(history, np.float32), seconds, raised)

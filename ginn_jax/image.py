@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from ginn_jax.architecture import Network
 from ginn_jax.checks import LARGEST, number
+from ginn_jax.dataset import relative_to
 from ginn_jax.errors import InputError
 from ginn_jax.example import numbers_asked
 from ginn_jax.inference import shade_points
@@ -98,7 +99,8 @@ def shade_image(
     if step == 1:
         return shade(surface, numbers)
     thickness = np.float32(0.2 * network.query.radius)
-    taken = _blend_between(step, surface, thickness)
+    near = surface._replace(position=counted_from(encoded.center, surface.position))
+    taken = _blend_between(step, near, thickness)
     places = tuple(sampled(n, step) for n in surface.mask.shape)
     between = np.array(taken.known)
     between[places] = False
@@ -120,7 +122,8 @@ def _shade_pixels(
 ) -> tuple[Float[np.ndarray, "H W *C"], Limits]:
     """Values of the pixels in the mask; `numbers`: material and light."""
     position, normal, mask = surface
-    rows = coherent_pixels(position, mask, COARSE * network.query.radius)
+    near = counted_from(encoded.center, position)
+    rows = coherent_pixels(near, mask, COARSE * network.query.radius)
     # `take` is three times as fast here as an index.
     position, normal = (
         np.reshape(a, (-1, 3)).take(rows, axis=0) for a in (position, normal)
@@ -134,6 +137,14 @@ def _shade_pixels(
     values = np.full((mask.size, *found.shape[1:]), background, np.float32)
     values[rows] = within_range(encoded, found)
     return values.reshape(*mask.shape, *found.shape[1:]), limits
+
+
+def counted_from(
+    center: Float[Any, "3"] | None, position: Float[np.ndarray, "H W 3"]
+) -> Float[np.ndarray, "H W 3"]:
+    """`relative_to` of an image, whose background may be anything."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return relative_to(center, position)
 
 
 def check_image(position: Any, normal: Any, mask: Any, background: float) -> None:
@@ -153,7 +164,7 @@ def within_range(
     encoded: Encoded, values: Float[np.ndarray, "*P"]
 ) -> Float[np.ndarray, "*P"]:
     """Output as what it can be: openness in [0, 1], or light, which is not negative."""
-    return np.clip(values, 0.0, 1.0 if encoded.scale is None else np.inf)
+    return as_openness(values) if encoded.scale is None else np.maximum(values, 0.0)
 
 
 def as_openness(values: Float[np.ndarray, "*P"]) -> Float[np.ndarray, "*P"]:

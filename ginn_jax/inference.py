@@ -111,9 +111,9 @@ def encode_cloud(
             unit length; material or light that the network does not take, or in other
             channels than each other; light below 0; or `kept_before` of another cloud.
     """
-    if not np.size(position):
-        raise InputError("the cloud is empty: sample at least one point")
     unit_rows(position, normal, "the cloud")
+    if not len(position):
+        raise InputError("the cloud is empty: sample at least one point")
     numbers_of("material", material, network.materials, len(position))
     numbers_of("light", light, network.lights, len(position), least=0.0)
     channels_alike(material, light)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
+from ginn_jax.candidates import DENSE_PACKET
 from ginn_jax.checks import LARGEST_INDEX
 from ginn_jax.errors import InputError
 from ginn_jax.process import spare_memory_maps
@@ -40,7 +41,10 @@ class Limits:
     def of(self, name: str) -> int:
         """The capacity called `name`."""
         if (size := dict(self.sizes).get(name)) is None:
-            raise InputError(f"the limits lack {name}: they are of another network")
+            raise InputError(
+                f"the limits lack {name}: they are of another network: give those "
+                "of this one"
+            )
         return size
 
 
@@ -153,7 +157,7 @@ def raise_limits(limits: Limits, demands: dict[str, int], slack: float) -> Limit
     """
     sizes = dict(limits.sizes)
     for name, need in demands.items():
-        if need * slack >= LARGEST_INDEX:
+        if need * slack >= most_of(name):
             raise InputError(
                 f"{name} would need {need} or more: points coincide or crowd within "
                 "the radius; merge those, or choose smaller radii"
@@ -163,8 +167,13 @@ def raise_limits(limits: Limits, demands: dict[str, int], slack: float) -> Limit
     return Limits(tuple(sizes.items()))
 
 
+def most_of(name: str) -> int:
+    """The largest capacity whose entries can be counted: a word is one a query."""
+    return LARGEST_INDEX // (DENSE_PACKET if name.endswith(".words") else 1)
+
+
 def round_up(count: int) -> int:
-    """A capacity with at most 1/16 to spare, so that few shapes are compiled.
+    """A capacity with at most 1/8 to spare, so that few shapes are compiled.
 
     Of what is not needed at all too: arrays of no rows cannot be gathered from.
     """

@@ -19,6 +19,7 @@ from ginn_jax.limits import Limits
 from ginn_jax.network import Variables
 from ginn_jax.recipe import Training
 from ginn_jax.run_record import (
+    RECORD,
     check_names,
     damaged,
     limits_from,
@@ -36,12 +37,12 @@ def load_manifest(folder: Path = FOLDER) -> dict[str, Record]:
     """What there is, by name, and how each came to be.
 
     Raises:
-        InputError: no manifest there, or a damaged one.
+        InputError: a damaged manifest; one that is not there says of none.
     """
     path = folder / MANIFEST
     if not path.exists():
         return {}
-    found = read_record(path, "no manifest: install the package again")
+    found = read_record(path, "no manifest")
     if not isinstance(found, dict):
         raise InputError(f"{path} is damaged: install the package again")
     return found
@@ -57,7 +58,7 @@ def load_pretrained(
     """
     manifest = load_manifest(folder)
     if name not in manifest:
-        known = ", ".join(sorted(manifest)) or "none"
+        known = ", ".join(sorted(manifest)) or "none, so install the package again"
         raise InputError(f"no trained network {name!r}: there are {known}")
     with damaged(folder / MANIFEST, "install the package again"):
         config = training_from(manifest[name]["training"])
@@ -118,24 +119,33 @@ def export(run: Path, name: str, more: Record, folder: Path = FOLDER) -> Path:
     """Write the weights of a finished run into `folder`, with a record of the run.
 
     Raises:
-        InputError: no finished run there.
+        InputError: no finished run there, or one whose records are damaged.
     """
     _, limits, variables = load_weights(run)
-    metrics = read_record(run / "metrics.json", "no metrics.json: let its run finish")
+    record = record_of(run, limits) | more
     folder.mkdir(parents=True, exist_ok=True)
     leaves, _ = jax.tree.flatten_with_path(variables)
     arrays = {place(keys): np.asarray(leaf) for keys, leaf in leaves}
     save_arrays(folder / f"{name}.npz", arrays, {"name": name})
     manifest = load_manifest(folder)
-    manifest[name] = record_of(run, metrics, limits) | more
+    manifest[name] = record
     with writing(folder / MANIFEST) as path:
         path.write_text(json.dumps(manifest, indent=1, sort_keys=True) + "\n")
     return folder / f"{name}.npz"
 
 
-def record_of(run: Path, metrics: Record, limits: Limits) -> Record:
+def record_of(run: Path, limits: Limits) -> Record:
     """What the manifest says of a run; paths are of whoever trained, so left out."""
-    made = json.loads((run / "run.json").read_text())
+    missing = "no {}: let its run finish"
+    metrics, made = (
+        read_record(run / name, missing.format(name))
+        for name in ("metrics.json", RECORD)
+    )
+    with damaged(run / "metrics.json", "let its run finish again, by --resume"):
+        return _record(metrics, made, limits)
+
+
+def _record(metrics: Record, made: Record, limits: Limits) -> Record:
     names = ("relative_mse_3d", "median_relative_mse_3d", "equal_rays", "clouds")
     pooled = {
         key: value

@@ -21,6 +21,11 @@ def tile_rows(capacity: int, most: int = TILE) -> int:
     return min(most, capacity) if jax.default_backend() == "cpu" else capacity
 
 
+def tiles_holding(rows: Int[Array, ""], size: int) -> Int[Array, ""]:
+    """Tiles of that size that hold so many rows, for any number of them."""
+    return -(-rows // max(size, 1))
+
+
 def fill(
     make: Callable[[Int[Array, "T"]], Made],
     count: Int[Array, ""],
@@ -46,7 +51,7 @@ def fill(
             lambda a, b: jax.lax.dynamic_update_slice_in_dim(a, b, start, 0), made, some
         )
 
-    tiles = (jnp.minimum(count, capacity) + size - 1) // max(size, 1)
+    tiles = tiles_holding(jnp.minimum(count, capacity), size)
     return jax.lax.fori_loop(0, tiles, add, zeros)
 
 
@@ -110,7 +115,7 @@ def range_slots(
         return begin, opened.at[place].add(1, mode="drop"), stop[-1]
 
     nothing = jnp.zeros_like(padded), jnp.zeros(capacity, jnp.int32), jnp.int32(0)
-    tiles = (listed + size - 1) // max(size, 1)
+    tiles = tiles_holding(listed, size)
     begin, opened, _ = jax.lax.fori_loop(0, tiles, open_slots, nothing)
     total = saturating_sum(length)
     # Tiles that are not taken leave zeros, but what is not listed begins at the end.
@@ -130,7 +135,7 @@ def _sum_tiles(counts: Int[Array, "K"], count: Int[Array, ""]) -> Int[Array, "K"
         summed = jax.lax.dynamic_update_slice_in_dim(summed, some, tile * size, axis=0)
         return summed, some[-1]
 
-    tiles = (jnp.minimum(count, counts.shape[0]) + size - 1) // max(size, 1)
+    tiles = tiles_holding(jnp.minimum(count, counts.shape[0]), size)
     nothing = jnp.zeros_like(padded), jnp.int32(0)
     return jax.lax.fori_loop(0, tiles, add, nothing)[0][: counts.shape[0]]
 

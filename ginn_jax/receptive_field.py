@@ -68,8 +68,7 @@ def tile_size(edges: int) -> int:
 
 def tile_count(edges: int, count: Int[Array, ""]) -> Int[Array, ""]:
     """Tiles with real edges."""
-    size = tile_size(edges)
-    return (jnp.minimum(count, edges) + size - 1) // size
+    return -(-jnp.minimum(count, edges) // tile_size(edges))
 
 
 def kernel_inputs(

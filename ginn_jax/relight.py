@@ -158,6 +158,10 @@ def relight(
     check_prepared("queries", queries, *(t.asking.queries.mask for t in ready.turns))
     size = block_size(len(queries.position), lit=True)
     asked = network_numbers(queries) if network.asks == "all" else (None, None)
+    if network.asks == "all":
+        count = len(queries.position)
+        numbers_of("material of queries", asked[0], network.materials, count)
+        numbers_of("light of queries", asked[1], network.lights, count, least=0.0)
     own = (channels_in_turns(a, size, len(ready.turns)) for a in asked)
     turns = zip(ready.turns, *own, strict=True)
     values = [_shade_turn(network, shared, turn) for turn in turns]

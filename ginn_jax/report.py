@@ -20,8 +20,8 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from ginn_jax.files import writing
 from ginn_jax.metrics import equal_tracing, tone_map
 from ginn_jax.process import available_cores
+from ginn_jax.run_record import RESULTS
 
-RESULTS = ("metrics.json", "report.md")
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "mitsuba", "trimesh")
 # What `beside_tracing` adds to a row, and what it is called.
 TRACING = {

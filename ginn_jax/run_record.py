@@ -17,6 +17,7 @@ from ginn_jax.room import Room
 from ginn_jax.searches import limit_names
 
 RECORD = "run.json"
+RESULTS = ("metrics.json", "report.md")
 OLD = "{} is of another version of ginn_jax: train again"
 UNSPENT = {"compile": 0.0, "train": 0.0}
 
@@ -27,19 +28,27 @@ def save_run(
     room: Room,
     extra: dict[str, Any],
     seconds: Mapping[str, float] = UNSPENT,
+    raised: Mapping[str, int] | None = None,
 ) -> None:
-    """Write what a resumed run must agree with, its capacities and the time spent."""
+    """Write what a resumed run must agree with, its capacities and the time spent.
+
+    What was reported of an earlier run there is removed: it is of other weights.
+    """
     record = {"training": asdict(config), "seconds": dict(seconds), **extra}
     record |= {"limits": dict(room.most.sizes), "usual": dict(room.usual.sizes)}
+    record |= {"raised": dict(raised or {})}
     text = json.dumps(record, indent=1, sort_keys=True)
     with writing(folder / RECORD) as new:
         new.write_text(text)
+        for name in RESULTS:
+            (folder / name).unlink(missing_ok=True)
 
 
 def load_run(
     folder: Path, config: Training, extra: dict[str, Any]
-) -> tuple[Room, dict[str, float]]:
-    """Capacities of the run to be resumed, and the seconds it took by purpose.
+) -> tuple[Room, dict[str, float], dict[str, int]]:
+    """Capacities of the run to be resumed, the seconds it took by purpose, and which
+    capacities it raised on the way.
 
     Raises:
         InputError: no run there, an unreadable record, or other settings than now.
@@ -53,6 +62,7 @@ def load_run(
         room = Room(limits_from(record, "usual"), limits_from(record))
         spent = record.get("seconds", UNSPENT)
         seconds = {name: float(spent[name]) for name in UNSPENT}
+        raised = {name: int(n) for name, n in record.get("raised", {}).items()}
     wanted = json.loads(json.dumps({"training": asdict(config), **extra}))
     for name in sorted(wanted["training"]):
         if training.get(name) != wanted["training"][name]:
@@ -66,7 +76,7 @@ def load_run(
             )
     for limits in room.each():
         check_names(path, config.network, limits)
-    return room, seconds
+    return room, seconds, raised
 
 
 def check_names(path: Path, network: Network, limits: Limits) -> None:

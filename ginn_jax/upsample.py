@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Shaped
 
+from ginn_jax.checks import real_array
 from ginn_jax.errors import InputError
 
 SHARPNESS = 8
@@ -53,8 +54,10 @@ def shading_step(scale: float) -> int:
     Raises:
         InputError: any other scale.
     """
-    step = round(1 / scale) if 0.9 / COARSEST < scale <= 1 else 0
-    if not abs(step * scale - 1) < 0.01:
+    given = real_array("resolution scale", scale)
+    usable = not given.ndim and 0.9 / COARSEST < scale <= 1
+    step = round(1 / scale) if usable else 0
+    if not (usable and abs(step * scale - 1) < 0.01):
         raise InputError(
             f"resolution scale {scale}: give 1 over a whole number up to {COARSEST}, "
             "as 1, .5 or .333"

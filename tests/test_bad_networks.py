@@ -7,12 +7,24 @@ from dataclasses import replace
 
 import numpy as np
 import tiny
-from refusals import INF, KEY, NAN, POINTS, UP, WORDS, Table, assert_refused, each_row
+from refusals import (
+    INF,
+    KEY,
+    NAN,
+    POINTS,
+    RAGGED,
+    UP,
+    WORDS,
+    Table,
+    assert_refused,
+    each_row,
+)
 
 from ginn_jax import image, inference, metrics, presets
 from ginn_jax.searches import uniform_limits
 from ginn_jax.shading import Encoded
 
+HALF = np.ones((20, 3), np.float16)
 PICTURE = np.ones((12, 12))
 FRAME = {"position": POINTS.reshape(4, 5, 3), "normal": UP.reshape(4, 5, 3)}
 
@@ -65,7 +77,7 @@ OTHER = uniform_limits(presets.RELEASED, 64)
 
 TABLE: Table = {
     encode: [
-        ({"position": POINTS[:0]}, "the cloud is empty: sample"),
+        ({"position": POINTS[:0], "normal": UP[:0]}, "the cloud is empty: sample"),
         ({"position": POINTS[:, :2]}, r"the cloud \(20, 2\) .* must both be"),
         ({"normal": UP[:5]}, r"normals \(5, 3\) must both be \[N, 3\]"),
         ({"position": WORDS}, "the cloud holds <U1: give real numbers"),
@@ -90,6 +102,13 @@ TABLE: Table = {
         ),
         ({"network": LIT, "light": np.ones((0, 20, 1))}, "light is .0, 20, 1., the"),
         ({"position": POINTS.astype(float) * 1e39}, "the cloud holds non-finite"),
+        ({"position": HALF * np.float16(INF)}, "the cloud holds non-finite"),
+        ({"position": RAGGED}, "the cloud has rows of unequal length"),
+        ({"normal": (127 * UP).astype(np.int8)}, "normals are .* not of unit length"),
+        (
+            {"network": LIT, "light": np.full((3, 20, 1), INF, np.float16)},
+            "light holds non-finite",
+        ),
         ({"limits": OTHER}, "the limits lack .*: they are of another network"),
     ],
     shade: [
@@ -120,6 +139,8 @@ TABLE: Table = {
         ({"background": NAN}, "background nan must be"),
         ({"resolution_scale": 0.0}, "resolution scale 0.0: give 1 over a whole number"),
         ({"resolution_scale": NAN}, "resolution scale nan: give"),
+        ({"resolution_scale": "half"}, "resolution scale holds <U4: give real"),
+        ({"resolution_scale": [0.5]}, r"resolution scale \[0.5\]: give 1 over"),
     ],
     metrics.mse: [
         ((WORDS, WORDS), "holds <U1: give real numbers"),
@@ -153,6 +174,16 @@ TABLE: Table = {
             "pool_1 begins on level 0, where the table has come to 1",
         ),
         ({"encoder": tiny.NETWORK.encoder[:1] * 2}, "two convolutions are called"),
+        ({"levels": ("a", 0.1)}, "level holds <U1: give real numbers"),
+        ({"query": conv(name="latent")}, "no convolution can be called latent: rename"),
+        ({"query": conv(name="level_0")}, "no convolution can be called level_0"),
+        ({"query": conv(name="query.x")}, "no convolution can be called query.x"),
+        ({"local": True}, "a network without lights has none on a linear path"),
+        ({"beams": 2}, "a network without lights has none on a linear path"),
+        (
+            {"lights": 1, "local": True, "query": conv(mixes=True)},
+            "f_2D mixes, but light near a query passes it by itself",
+        ),
         (
             {"encoder": tiny.NETWORK.encoder[:2], "query": conv(source=1)},
             "no convolution within level 1",

@@ -7,8 +7,9 @@ import jax
 import numpy as np
 import pytest
 import tiny
+from rich.console import Console
 
-from ginn_jax import checkpoint, run_record
+from ginn_jax import checkpoint, experiment, run_record
 from ginn_jax.errors import InputError
 from ginn_jax.limits import Limits
 from ginn_jax.room import Room
@@ -17,6 +18,7 @@ CONFIG = replace(tiny.CONFIG, network=tiny.ONE_LEVEL)
 LIMITS = tiny.ONE_LEVEL_LIMITS
 ROOM = Room(Limits(tuple((name, size // 2) for name, size in LIMITS.sizes)), LIMITS)
 EXTRA = {"clouds": 12, "rays": 64}
+RAISED = {"level_0.edges": 4096}
 SECONDS = {"compile": 31.5, "train": 280.0}
 
 
@@ -135,15 +137,17 @@ def test_checkpoint_of_another_network_is_refused(third, tmp_path):
 @pytest.fixture
 def recorded(tmp_path):
     """A folder with the record of a run."""
-    run_record.save_run(tmp_path, CONFIG, ROOM, EXTRA, SECONDS)
+    for name in run_record.RESULTS:
+        (tmp_path / name).write_text("of earlier weights")
+    run_record.save_run(tmp_path, CONFIG, ROOM, EXTRA, SECONDS, RAISED)
     return tmp_path
 
 
 def test_record_comes_back(recorded):
-    room, seconds = run_record.load_run(recorded, CONFIG, EXTRA)
+    room, seconds, raised = run_record.load_run(recorded, CONFIG, EXTRA)
     assert dict(room.usual.sizes) == dict(ROOM.usual.sizes)
     assert dict(room.most.sizes) == dict(LIMITS.sizes)
-    assert seconds == SECONDS
+    assert (seconds, raised) == (SECONDS, RAISED)
     assert [p.name for p in recorded.iterdir()] == ["run.json"]
 
 
@@ -196,6 +200,18 @@ def test_damaged_record_is_refused(recorded, damage):
     path.write_text(damage(path.read_text()))
     with pytest.raises(InputError, match=r"^[^\n]*run\.json[^\n]*$"):
         run_record.load_run(recorded, CONFIG, EXTRA)
+
+
+def test_a_run_that_is_refused_keeps_its_results(recorded):
+    results = [recorded / name for name in run_record.RESULTS]
+    for path in results:
+        path.write_text("of its weights")
+    options = experiment.RunOptions(out=recorded, resume=True)
+    clouds = [tiny.sphere_on_plane(CONFIG.points, seed) for seed in range(2)]
+    for config, given in ((CONFIG, []), (replace(CONFIG, steps=1), clouds)):
+        with pytest.raises(InputError):
+            experiment.train(Console(), config, given, options, EXTRA)
+    assert [path.read_text() for path in results] == ["of its weights"] * 2
 
 
 def test_undecodable_record_is_refused(recorded):

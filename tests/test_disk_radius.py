@@ -26,7 +26,7 @@ def test_unusable_disk_radius_is_refused(radius):
 
 def test_disk_radius_beyond_level_1_is_refused():
     network = replace(tiny.NETWORK, levels=(0.08, 0.1))
-    with pytest.raises(InputError, match=r"exceeds level 1's 0\.1"):
+    with pytest.raises(InputError, match=r"exceeds level 1's: give one up to 0\.1"):
         with_disk_radius(network, 0.12)
 
 
@@ -78,6 +78,15 @@ def test_limits_at_another_radius_are_those_that_suffice(radius, column):
     for name, demands in found.items():
         size = scaled.of(name)
         assert demands[column] <= size <= 1.8 * demands[column] + 64, name
+
+
+@pytest.mark.parametrize("radius", [0.005, 1e-9])
+def test_beyond_what_was_measured_limits_stay(radius):
+    limits = Limits((("conv_0.edges", 4096), ("level_0.points", 640)))
+    network = compact_network()
+    farthest = limits_at(network, limits, network.levels[0] / 2)
+    assert limits_at(network, limits, radius) == farthest
+    assert farthest.of("conv_0.edges") > 4 * 4096
 
 
 def test_other_limits_do_not_go_with_the_radius():

@@ -68,6 +68,16 @@ def test_errors_are_named_by_their_set(exported, tmp_path):
     assert set(pretrained.load_manifest(tmp_path)["ao"]["errors"]) == set(sets)
 
 
+@pytest.mark.parametrize("content", ["no JSON", "{}", '{"unseen shapes": {}}'])
+def test_a_run_of_damaged_records_is_not_exported(exported, tmp_path, content):
+    _, _, run = exported
+    shutil.copytree(run, tmp_path / "run")
+    (tmp_path / "run" / "metrics.json").write_text(content)
+    with pytest.raises(InputError, match=r"metrics.json is damaged: [^\n]*finish"):
+        pretrained.export(tmp_path / "run", "ao", {}, tmp_path)
+    assert not (tmp_path / "ao.npz").exists()
+
+
 @pytest.mark.parametrize("begun", ["None", "runs/first"])
 def test_what_training_began_with_is_told(exported, begun):
     folder, *_ = exported
@@ -82,7 +92,7 @@ def test_unknown_names_and_damaged_files_are_told(exported, tmp_path):
     folder, *_ = exported
     with pytest.raises(InputError, match=r"'water'.*there are ao"):
         pretrained.load_pretrained("water", folder)
-    with pytest.raises(InputError, match="there are none"):
+    with pytest.raises(InputError, match="none, so install the package"):
         pretrained.load_pretrained("ao", tmp_path)
     manifest = (folder / pretrained.MANIFEST).read_text()
     (tmp_path / pretrained.MANIFEST).write_text(manifest)

@@ -34,6 +34,12 @@ def test_demand_saturates_where_int32_would_wrap(total):
     assert int(demand) == min(total, INT32_MAX)
 
 
+@given(st.integers(0, INT32_MAX), st.integers(0, INT32_MAX))
+def test_as_many_tiles_as_hold_the_rows(rows, size):
+    """Of any number that int32 has, and rounded up without leaving it."""
+    assert int(rg.tiles_holding(jnp.int32(rows), size)) == -(-rows // max(size, 1))
+
+
 @pytest.fixture(scope="module")
 def expand():
     return jax.jit(rg.expand_ranges, static_argnames="capacity")

@@ -143,6 +143,9 @@ def test_relighting_is_shading(case):
         ]
         expected = np.maximum(shade(network, variables, *lights), 0)
         close(relight(network, variables, ready, *lights), expected)
+    if network.asks == "all":
+        with pytest.raises(InputError, match=r"^light of queries holds non-finite"):
+            relight(network, variables, ready, cloud, scaled(queries, np.nan))
 
 
 def test_queries_out_of_reach_have_values_in_either_way(case):
@@ -177,7 +180,7 @@ def test_no_queries_have_no_values(prepared):
     [
         (lit(399, 1), lit(0, 2), "the cloud has 399 points, 400 were prepared"),
         (lit(400, 1), lit(5, 2), "queries has 5 points, 0 were prepared"),
-        (scaled(lit(400, 1), np.nan), lit(0, 2), "light holds non-finite"),
+        (scaled(lit(400, 1), np.nan), lit(0, 2), "^light holds non-finite"),
     ],
 )
 def test_what_was_not_prepared_is_refused(prepared, cloud, queries, message):

@@ -10,16 +10,18 @@ import tiny
 import trimesh
 
 from benchmarks import stability, stability_cases, stability_stages
-from ginn_jax import dataset, hierarchy, inference, irradiance, train
+from ginn_jax import dataset, hierarchy, image, inference, irradiance, train
 from ginn_jax.dataset import unit_light
 from ginn_jax.errors import InputError
 from ginn_jax.lighting import PointLight
 from ginn_jax.limits import Limits, raise_limits
 from ginn_jax.mesh import Mesh
+from ginn_jax.shading import Encoded
 
 KEY = jax.random.key(0)
 CLOUD = tiny.sphere_on_plane(300, 0)
-CONFIG = replace(tiny.CONFIG, network=tiny.ONE_LEVEL)
+NETWORK = tiny.ONE_LEVEL
+CONFIG = replace(tiny.CONFIG, network=NETWORK)
 LIMITS = tiny.ONE_LEVEL_LIMITS
 
 # Light
@@ -101,6 +103,26 @@ def test_a_cloud_far_away_looks_as_it_does_here(offset):
     np.testing.assert_allclose(there, here, atol=1e-5 * np.abs(here).max())
 
 
+@pytest.mark.parametrize("offset", [1e3, 1e4, 1e6])
+def test_a_picture_far_away_has_the_edges_that_it_has_here(offset, monkeypatch):
+    """Two floors, .02 apart, are told apart in the float64 that they come in."""
+
+    def shade_heights(network, limits, variables, encoded, position, *_):
+        return np.float32(position[:, 1] - offset > 0.01), limits
+
+    monkeypatch.setattr(image, "shade_points", shade_heights)
+    x, z = np.meshgrid(*2 * [np.linspace(-0.6, 0.6, 24)])
+    upper = x < 0
+    position = np.stack([x, np.where(upper, 0.02, 0.0), z], axis=-1) + offset
+    network = replace(NETWORK, query=replace(NETWORK.query, radius=0.02))
+    center = dataset.center_of(position.reshape(-1, 3))
+    codes = Encoded(*4 * [None], None, center)
+    up = np.broadcast_to(np.float32([0, 1, 0]), position.shape)
+    frame = codes, position, up, np.ones(x.shape, bool)
+    found, _ = image.shade_image(network, LIMITS, {}, *frame, resolution_scale=0.5)
+    np.testing.assert_allclose(found, upper, atol=1e-3)
+
+
 def test_clouds_of_a_batch_are_counted_from_their_middle():
     """Before anything turns them, which far from the origin would round them."""
     cloud = CLOUD._replace(position=CLOUD.position.astype(np.float64))
@@ -132,6 +154,13 @@ def test_more_pairs_than_can_be_counted_are_refused():
     with pytest.raises(InputError, match=r"^level_0\.edges would [^\n]*merge[^\n]*\Z"):
         raise_limits(limits, {"level_0.edges": 2**31 - 1}, 1.25)
     assert raise_limits(limits, {"level_0.edges": 2**30}, 1.25).of("level_0.edges")
+
+
+def test_words_are_as_many_as_their_queries_can_be_counted():
+    limits = Limits((("query.words", 64),))
+    with pytest.raises(InputError, match=r"^query\.words would need 20000000 "):
+        raise_limits(limits, {"query.words": 20_000_000}, 1.25)
+    assert raise_limits(limits, {"query.words": 10_000_000}, 1.25).of("query.words")
 
 
 # Float64, to compare with
