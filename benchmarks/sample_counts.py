@@ -16,7 +16,13 @@ from jaxtyping import Int
 
 from benchmarks.timing import circumstances, describe
 from ginn_jax import compare, evaluate, report
-from ginn_jax.commandline import require, require_positive, require_some, start
+from ginn_jax.commandline import (
+    command_line,
+    require,
+    require_positive,
+    require_some,
+    start,
+)
 from ginn_jax.compare_networks import Trained, load_trained, rows_at_points
 from ginn_jax.dataset import count_asked, count_given
 from ginn_jax.errors import InputError
@@ -137,10 +143,12 @@ def write_report(options: Options, trained: Trained, metrics: evaluate.Row) -> s
 
 {describe()}
 
-{options.objects} scenes, Poisson disk radii {trained[0].levels}. The network is given
-the first of the same samples, and asked at the first of the same other points; noise of
-the reference ({options.reference} rays or paths) is subtracted. Relative: over the
-variance of the target, pooled over the scenes.
+`{command_line("benchmarks.sample_counts", options)}`
+
+{metrics["rows"][0]["clouds"]} scenes, Poisson disk radii {trained[0].levels}. The
+network is given the first of the same samples, and asked at the first of the same other
+points; noise of the reference is subtracted. Relative: over the variance of the target,
+pooled over the scenes.
 
 {report.table_of(metrics["rows"], heads)}
 Most of the error with all samples is of

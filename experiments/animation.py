@@ -24,7 +24,7 @@ from ginn_jax.animation_report import (
     write_report,
 )
 from ginn_jax.camera import orbit_camera
-from ginn_jax.commandline import require, require_positive, start
+from ginn_jax.commandline import command_line, require, require_positive, start
 from ginn_jax.compare import Stage
 from ginn_jax.compare_frames import Playing, shade_next, start_playing
 from ginn_jax.compare_networks import OURS, Trained, disk_variants, load_networks
@@ -123,6 +123,7 @@ def main(options: Options) -> dict[str, Any]:
         "sequences": found,
         "frames": {name: len(meshes) for name, meshes in scenes.items()},
         "samples": settings.points,
+        "command": command_line("experiments.animation", options),
         "options": {k: str(v) for k, v in asdict(options).items()},
         "environment": report.environment(),
     }

@@ -81,6 +81,7 @@ def main(options: Options) -> dict[str, Any]:
     settings = scenes.Occlusion(options.points, options.rays, options.radius)
     train_sources = training_sources(options)
     test_sources = held_back_sources(options)
+    objects.check_unseen(train_sources, test_sources)
     begin = time.perf_counter()
     folder = options.out / "data"
     clouds = make(

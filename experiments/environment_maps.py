@@ -29,7 +29,7 @@ from ginn_jax.lighting import (
 from ginn_jax.lit_clouds import mean_light
 from ginn_jax.lit_scenes import Scattering, light_mesh, lit_points
 from ginn_jax.mesh import add_ground, fit_unit_box, load_mesh
-from ginn_jax.metrics import tone_map
+from ginn_jax.metrics import foreground, tone_map
 from ginn_jax.objects import UNSEEN_SEED, random_point_light, tell_apart
 from ginn_jax.pairing import spread
 from ginn_jax.pretrained import load_network
@@ -148,7 +148,7 @@ def draw(path: Path, pictures: list[tuple[str, np.ndarray, np.ndarray]]) -> None
     grid = figure.subplots(2, count, squeeze=False)
     for column, (name, right, mine) in zip(grid.T, pictures, strict=True):
         for axes, image in zip(column, (right, mine), strict=True):
-            axes.imshow(tone_map(image, right, right.sum(-1) > 0))
+            axes.imshow(tone_map(image, right, foreground(right)))
             axes.axis("off")
         column[0].set_title(name, fontsize=7)
     figure.savefig(path, dpi=120)

@@ -17,9 +17,15 @@ from rich.console import Console
 
 from ginn_jax import compare, compare_figures, compare_report, report
 from ginn_jax.camera import orbit_camera
-from ginn_jax.commandline import require, require_positive, require_some, start
+from ginn_jax.commandline import (
+    command_line,
+    require,
+    require_positive,
+    require_some,
+    start,
+)
 from ginn_jax.compare import Compared, Picture, Shot
-from ginn_jax.compare_light import counted_rows
+from ginn_jax.compare_light import counted_rows, sampling_seconds
 from ginn_jax.compare_networks import (
     NETWORKS,
     OURS,
@@ -98,13 +104,8 @@ class Options:
 
 
 QUICK = {"objects": 1, "views": 1, "resolution": 64, "reference": 16, "points": 4000}
-QUICK |= {
-    "counts": (1, 4),
-    "disks": (),
-    "scales": (0.5,),
-    "draws": 2,
-    "fewer_looks": (32,),
-}
+QUICK |= {"counts": (1, 4), "disks": (), "scales": (0.5,), "draws": 2}
+QUICK |= {"fewer_looks": (32,)}
 
 
 def main(options: Options) -> dict[str, Any]:
@@ -141,16 +142,15 @@ def main(options: Options) -> dict[str, Any]:
         for name in NETWORKS
     }
     at_points = {n: r | {"memory_mib": memory[n]} for n, r in at_points.items()}
-    names = [source.name for source in sources]
-    metrics = summary(options, at_points, found, names)
-    shown = [(name, scene.shown) for name, scene in zip(names, found, strict=True)]
+    metrics = summary(options, at_points, found, [source.name for source in sources])
+    shown = [(s.name, scene.shown) for s, scene in zip(sources, found, strict=True)]
     compare_figures.draw_methods(options.out / "ablation.png", shown[:4])
     lines = metrics["error_against_time"], metrics["light_counted"]
     compare_figures.draw_front(options.out / "error_against_time.png", *lines)
     text = compare_report.write_report(TITLES[options.effect], metrics)
     report.write_results(options.out, metrics, text)
-    lost = metrics["lost_cells"]
-    console.print(f"{len(lost)} cells lost: {options.out / 'report.md'}")
+    lost = len(metrics["lost_cells"])
+    console.print(f"{lost} cells lost: {options.out / 'report.md'}")
     return metrics
 
 
@@ -164,10 +164,11 @@ def compare_scene(
     """All methods on all views of a scene, and the networks with limits that do."""
     stage = compare.set_stage(source, settings)
     given, units = points_given(cloud)
+    apart = sampling_seconds(stage, len(given.position), seed=source.seed)
     rows, front, shown, counted = [], [], {}, []
+    size = options.resolution
     for view in range(options.views):
         azimuth = 35.0 + 360.0 * view / options.views
-        size = options.resolution
         camera = orbit_camera(azimuth, width=size, height=size)
         shot = compare.take_shot(stage, camera, settings, seed=source.seed)
         extra = {"reference": options.reference, "size": size, "azimuth": azimuth}
@@ -181,11 +182,13 @@ def compare_scene(
             called = name, networks[name]
             picture, networks[name] = network_picture(*called, given, shot)
             pictures.append(picture)
-        rows += [p.row | {"name": source.name, "view": view} for p in pictures]
+        about = {"name": source.name, "view": view, "seconds_sampling": apart}
+        about |= {"noise_dssim": compare.noise_dssim(shot, seed=view)}
+        rows += [p.row | about for p in pictures]
         if view == 0:
             shown = compare.displayed(shot, pictures)
             looks = sorted({options.looks, *options.fewer_looks})
-            ends = stage, given, shot, networks[OURS], looks
+            ends = stage, given, shot, networks[OURS], looks, apart
             counted, networks[OURS] = counted_rows(*ends, seed=source.seed)
             front += [p.row for p in pictures]
             own = next(p for p in pictures if p.row["method"] == OURS)
@@ -239,6 +242,7 @@ def summary(
     metrics = compare_report.summary(options.effect, at_points, *tables.values())
     metrics |= tables
     metrics |= {"objects": len(names), "names": names}
+    metrics |= {"command": command_line("experiments.evaluate", options)}
     metrics |= {"options": {k: str(v) for k, v in asdict(options).items()}}
     metrics |= {"environment": report.environment()}
     return metrics | {"peak_memory_gib": report.peak_memory_gib()}

@@ -79,6 +79,8 @@ def write_report(m: dict[str, Any]) -> str:
     several = len(found) > 1
     return f"""# Animation, {options["effect"]}
 
+`{m["command"]}`
+
 {", ".join(f"{name} ({m['frames'][name]} frames)" for name in found)} at
 {options["resolution"]} x {options["resolution"]}, reference of {options["reference"]}
 rays or paths a pixel. Networks are given {m["samples"]} samples of a frame.

@@ -52,6 +52,18 @@ def start(
         fail(message, code)
 
 
+def command_line(module: str, options: Any) -> str:
+    """The command that runs a script with these options, but for where it writes."""
+    words, usual = [f"python -m {module}"], type(options)()
+    for field in fields(options):
+        value = getattr(options, field.name)
+        if field.name != "out" and value != getattr(usual, field.name):
+            given = value if isinstance(value, tuple | list) else (value,)
+            words += [f"--{field.name.replace('_', '-')}"]
+            words += [] if value is True else map(str, given)
+    return " ".join(words)
+
+
 def silence_threads() -> None:
     """Let no thread print a traceback: what matters of it reaches the main one.
 

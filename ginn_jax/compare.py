@@ -153,6 +153,18 @@ def errors(shot: Shot, values: Values, units: Float[np.ndarray, "C"] | None) -> 
     return row | of_variance(shot, row)
 
 
+def noise_dssim(shot: Shot, *, seed: int) -> float:
+    """DSSIM of the reference with as much Gaussian noise again as it has itself.
+
+    No method can be told to be better than about that.
+    """
+    target = target_of(shot)
+    variance = shot.variance if isinstance(shot, View) else shot.pixels.variance
+    noise = np.random.default_rng(seed).normal(size=target.shape) * np.sqrt(variance)
+    noisy = np.asarray(target + noise, np.float32)
+    return errors(shot, noisy, np.ones(3))["dssim_2d"]
+
+
 def of_variance(shot: Shot, row: Row) -> Row:
     """The error of a row over the variance of the reference, and that variance."""
     if isinstance(shot, View):

@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 from ginn_jax import report
 from ginn_jax.compare_networks import OURS
 from ginn_jax.evaluate import Row
-from ginn_jax.metrics import tone_map
+from ginn_jax.metrics import foreground, tone_map
 
 
 def draw_front(path: Path, rows: list[Row], counted: Sequence[Row]) -> None:
@@ -63,11 +63,6 @@ def draw_methods(
             axes.axis("off")
             _inset(axes, shown, corner, size)
     figure.savefig(path, dpi=110)
-
-
-def foreground(image: Float[np.ndarray, "H W *C"]) -> np.ndarray:
-    """Pixels that hold something in a reference."""
-    return (image.sum(-1) if image.ndim == 3 else image) > 0
 
 
 def inset_place(image: Float[np.ndarray, "H W *C"]) -> tuple[tuple[int, int], int]:

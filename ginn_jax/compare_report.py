@@ -100,10 +100,11 @@ def write_report(title: str, m: Mapping[str, Any]) -> str:
     against |= {"relative_mse_2d": "relative 2D", "dssim_2d": "2D DSSIM"}
     rows = report.beside_tracing(m["error_against_time"], "traced")
     lost = "\n".join(f"- {line}" for line in m["lost_cells"]) or "None."
+    ours = next(row for row in m["results"] if row["method"] == OURS)
     denoiser = "" if m["denoiser"] else " Open Image Denoise was not installed."
     return f"""# {title}
 
-`python -m experiments.evaluate --effect {options["effect"]}`, {m["objects"]} unseen
+`{m["command"]}`, {m["objects"]} unseen
 scenes, {options["views"]} views each at {options["resolution"]} x
 {options["resolution"]}: {", ".join(m["names"])}. {env["processor"]}, {env["cores"]}
 cores, {env["devices"]} JAX devices, jax {env["packages"]["jax"]}, mitsuba
@@ -111,8 +112,10 @@ cores, {env["devices"]} JAX devices, jax {env["packages"]["jax"]}, mitsuba
 
 {m["units"]} Noise of the reference ({options["reference"]} rays or paths a pixel, which
 also bounds how small an error can be told) is subtracted from every MSE. DSSIM is of
-the displayed image after the paper's tone mapping, over the foreground. 3D MSE is at
-points that no network was given.
+the displayed image after the paper's tone mapping, over the foreground; the noise of
+the reference, which cannot be subtracted here, makes up about
+{ours["noise_dssim"]:.2g} (as much again on top of it does). 3D MSE is at points that no
+network was given and that light reaches by one of 32 rays.
 
 ## The paper's table
 
@@ -123,8 +126,10 @@ Cells that our network loses against screen space of either kind, 2D only or 3D 
 
 ## Time and memory
 
-Same pixels, same machine, in turns; compilation, G-buffer and direct light apart.
-Memory is what the compiled functions ask for beside their inputs and outputs.
+Same pixels, same machine, one method after the other, medians of three calls after a
+first one; compilation, G-buffer and direct light apart, and the samples of the surface:
+{ours["seconds_sampling"]:.2g} s, once for all views of a scene. Memory is what the
+compiled functions ask for beside their inputs and outputs.
 
 {report.table_of(m["results"], times)}
 f_2D takes {m["share_2d"]:.0%} of our network's time (paper: 60 %).
@@ -150,16 +155,18 @@ def _of_light(m: Mapping[str, Any]) -> str:
     """Our network with what its direct light takes, which is in no other time."""
     if not m["light_counted"]:
         return ""
-    columns = {"method": "method", "seconds_samples": "light of samples s"}
+    columns = {"method": "method", "seconds_sampling": "samples s"}
+    columns |= {"seconds_samples": "their light s"}
     columns |= {"seconds_pixels": "of pixels s", "seconds_network": "network s"}
     columns |= {"seconds": "total s", "mse_2d": "2D MSE", "dssim_2d": "2D DSSIM"}
     traced = [row for row in m["error_against_time"] if "traced" in row]
     rows = report.beside_tracing([*m["light_counted"], *traced], "traced")
     rows = rows[: len(m["light_counted"])]
-    return f"""## With direct light counted
+    return f"""## With samples and direct light counted
 
-The networks are given direct light, which is in none of the times above. Here it is, at
-fewer looks a point as well, with the error that then is left. Light of pixels counts
+The networks are given samples and direct light, which are in none of the times above.
+Here they are, at fewer looks (directions of the light) a point as well, with the error
+that then is left. Light of pixels counts
 where the network asks for it; else it is the display alone that needs it, with tracing
 as well.
 

@@ -26,7 +26,7 @@ def screen_pictures(
         static = tuple({"camera": camera, **static}.items())
         shapes = tuple((image.shape, image.dtype) for image in images)
         compiled = compiled_screen(method, static, shapes)
-        image, _, seconds = timed(partial(compiled, *images), repeats=1)
+        image, seconds = timed(partial(compiled, *images))
         values = np.asarray(image)[mask]
         row = {"method": name, "seconds": seconds} | errors(shot, values, units)
         row["memory_mib"] = scratch_mib(compiled)

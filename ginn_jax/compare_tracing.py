@@ -47,7 +47,7 @@ def traced_picture(
 ) -> Picture:
     """Ray or path tracing with so many rays or paths a pixel."""
     work = partial(trace, shot, settings, count, seed=seed)
-    truth, _, seconds = timed(work, repeats=1)
+    truth, seconds = timed(work)
     what = "rays" if isinstance(shot, View) else "paths"
     row = {"method": f"{count} {what}", "traced": count, "seconds": seconds}
     return Picture(row | errors(shot, truth.mean, units), truth.mean)
@@ -67,7 +67,7 @@ def denoised_picture(shot: Shot, noisy: Picture, units: Any) -> Picture | None:
     guides = {"albedo": albedo, "normal": gbuffer.normal.astype(np.float32)}
     hdr = isinstance(shot, LitView)
     work = partial(denoise, color, **guides, hdr=hdr, clean_aux=True)
-    image, _, seconds = timed(work)
+    image, seconds = timed(work)
     image = np.asarray(image)
     values = (image[..., 0] if isinstance(shot, View) else image)[mask]
     row = {

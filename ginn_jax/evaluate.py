@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Key
 from ginn_jax.architecture import Network
 from ginn_jax.camera import Camera, orbit_camera
 from ginn_jax.dataset import ShadedPoints, count_given
+from ginn_jax.errors import InputError
 from ginn_jax.image import Encoded, as_openness, shade_image
 from ginn_jax.inference import encode_cloud, shade_points
 from ginn_jax.limits import Limits
@@ -74,17 +75,10 @@ def evaluate_clouds(
     rows = []
     for name, cloud in zip(names, clouds, strict=True):
         given, asked = split_cloud(cloud)
-        encoded, limits = encode_cloud(
-            network,
-            limits,
-            model.variables,
-            given.position,
-            given.normal,
-            key=model.key,
-        )
-        values, limits = shade_points(
-            network, limits, model.variables, encoded, asked.position, asked.normal
-        )
+        ends = model.variables, given.position, given.normal
+        encoded, limits = encode_cloud(network, limits, *ends, key=model.key)
+        ends = model.variables, encoded, asked.position, asked.normal
+        values, limits = shade_points(network, limits, *ends)
         noise = float(np.mean(asked.variance))
         raw = mse(as_openness(values), asked.target)
         spread = float(np.var(asked.target)) - noise
@@ -110,11 +104,18 @@ def split_cloud(cloud: ShadedPoints) -> tuple[ShadedPoints, ShadedPoints]:
 
 
 def pool_rows(rows: Sequence[Row]) -> Row:
-    """Means over the clouds; the relative error is a ratio of means, not their mean."""
+    """Means over the clouds; the relative error is a ratio of means, not their mean.
+
+    Clouds without light, whose errors have no unit, are left out and counted.
+    """
+    every, rows = len(rows), [row for row in rows if np.isfinite(row["mse_3d"])]
+    if not rows:
+        raise InputError("no light reaches any of the clouds to test on: choose others")
     names = ("mse_3d", "noise_floor_3d", "variance_3d", "ray_variance")
     pooled = {name: float(np.mean([row[name] for row in rows])) for name in names}
     return pooled | {
         "clouds": len(rows),
+        "dark_clouds": every - len(rows),
         "relative_mse_3d": relative_error(pooled["mse_3d"], pooled["variance_3d"]),
         "median_relative_mse_3d": median_known([r["relative_mse_3d"] for r in rows]),
         "equal_rays": equal_rays(pooled["mse_3d"], pooled["ray_variance"]),
@@ -169,14 +170,14 @@ def image_errors(view: View, image: Float[np.ndarray, "H W"]) -> Row:
     }
 
 
-def timed(work: Callable[[], Any], repeats: int = 3) -> tuple[Any, float, float]:
-    """Result, seconds of the first call (with compilation), median of the others."""
-    seconds, result = [], None
-    for _ in range(repeats + 1):
+def timed(work: Callable[[], Any]) -> tuple[Any, float]:
+    """Result, and the median of the seconds of three calls after a first one."""
+    seconds, result = [], jax.block_until_ready(work())
+    for _ in range(3):
         start = time.perf_counter()
         result = jax.block_until_ready(work())
         seconds.append(time.perf_counter() - start)
-    return result, seconds[0], float(np.median(seconds[1:]))
+    return result, float(np.median(seconds))
 
 
 def timed_network(
@@ -186,9 +187,9 @@ def timed_network(
 ) -> tuple[Encoded, Image, Limits, Row]:
     """Codes, an image, the limits that sufficed, and the seconds of f_3D and f_2D."""
     _, limits = encode(limits)
-    (encoded, limits), _, deep = timed(lambda: encode(limits))
+    (encoded, limits), deep = timed(lambda: encode(limits))
     _, limits = shade(limits, encoded)
-    (image, limits), _, flat = timed(lambda: shade(limits, encoded))
+    (image, limits), flat = timed(lambda: shade(limits, encoded))
     times = {"seconds_3d": deep, "seconds_2d": flat, "seconds": deep + flat}
     points = int(np.sum(encoded.points.mask))
     return encoded, image, limits, {"points": points} | times
@@ -228,7 +229,7 @@ def network_row(
 
 def ray_row(view: View, radius: float, rays: int, seed: int) -> Row:
     """Error and time of ray-traced ambient occlusion at `rays` per pixel."""
-    truth, _, seconds = timed(lambda: traced(view, radius, rays, seed=seed))
+    truth, seconds = timed(lambda: traced(view, radius, rays, seed=seed))
     row = {"method": f"{rays} rays", "rays": rays, "seconds": seconds}
     return row | image_errors(view, fill(view.gbuffer.mask, truth.mean, OPEN))
 

@@ -238,6 +238,6 @@ def path_row(
     view: LitView, paths: int, seed: int, scale: Float[np.ndarray, "C"]
 ) -> Row:
     """Error and time of path tracing the same pixels with `paths` each."""
-    truth, _, seconds = timed(lambda: traced(view, paths, seed=seed), repeats=1)
+    truth, seconds = timed(lambda: traced(view, paths, seed=seed))
     row = {"method": f"{paths} paths", "paths": paths, "seconds": seconds}
     return row | lit_image_errors(view, truth.mean, scale)

@@ -4,6 +4,7 @@ Radiance is linear RGB. An environment map is a latitude-longitude image: row 0 
 (+y), column u looks along (sin 2 pi u, -cos 2 pi u) in x and z, as in Mitsuba.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -80,13 +81,13 @@ def load_environment(path: str | Path) -> EnvironmentMap:
 
 
 def make_environment(radiance: Float[np.ndarray, "H W 3"]) -> EnvironmentMap:
-    """A map from its pixels, checked and averaged down to 256 rows."""
+    """A map from its pixels, checked and averaged down to 256 rows by solid angle."""
     radiance = _checked_radiance(radiance)
     if radiance.max() == 0:
         raise InputError("radiance is zero everywhere: the map is empty")
     height, width = radiance.shape[:2]
     if height > HEIGHT:
-        rows = _averaging(height, HEIGHT)
+        rows = _averaging(height, HEIGHT, lambda share: -np.cos(np.pi * share))
         columns = _averaging(width, max(round(width * HEIGHT / height), 1))
         radiance = np.einsum("iu,ujc->ijc", rows, radiance, optimize=True)
         radiance = np.einsum("jv,ivc->ijc", columns, radiance, optimize=True)
@@ -118,12 +119,17 @@ def _checked_radiance(radiance: Float[np.ndarray, "H W 3"]) -> np.ndarray:
     return radiance
 
 
-def _averaging(many: int, few: int) -> Float[np.ndarray, "few many"]:
-    """The shares that `many` equal parts of a length have in each of `few`."""
-    edges, start = np.linspace(0, many, few + 1), np.arange(many)
-    ends = np.minimum(edges[1:, None], start + 1)
-    shared = ends - np.maximum(edges[:-1, None], start)
-    return np.maximum(shared, 0) * few / many
+def _averaging(
+    many: int, few: int, measure: Callable[[np.ndarray], np.ndarray] = np.asarray
+) -> Float[np.ndarray, "few many"]:
+    """The shares that `many` equal parts of a length have in each of `few`.
+
+    `measure` is of what lies before a place from 0 to 1, such as the solid angle.
+    """
+    edges, places = (measure(np.linspace(0, 1, n + 1)) for n in (few, many))
+    ends = np.minimum(edges[1:, None], places[1:])
+    shared = np.maximum(ends - np.maximum(edges[:-1, None], places[:-1]), 0)
+    return shared / shared.sum(axis=1, keepdims=True)
 
 
 def constant_sky(radiance: float = 1.0) -> EnvironmentMap:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from ginn_jax.errors import InputError
 from ginn_jax.experiment import RunOptions
 from ginn_jax.lighting import find_environments
 from ginn_jax.mesh import find_meshes
@@ -13,6 +14,7 @@ from ginn_jax.objects import (
     UNSEEN_SEED,
     LightSource,
     Source,
+    check_unseen,
     file_lights,
     file_sources,
     point_lights,
@@ -64,7 +66,7 @@ def choose_sources(
     lights = procedural_lights(max(options.shapes, 30), seed * SEEDS_APART)
     maps = _files(options.envmaps, find_environments, file_lights)
     if options.split == "paper":
-        return paper_sources(options, objects, lights + maps)
+        return paper_sources(options, objects, maps + lights[: max(30 - len(maps), 0)])
     lights = mixed(lights, maps, len(objects) * each, seed)
     unseen = procedural_sources(options.test_shapes, UNSEEN_SEED + seed)
     maps = _files(options.test_envmaps, find_environments, file_lights)
@@ -74,7 +76,10 @@ def choose_sources(
     sets["point lights"] = pair_up(unseen[:4], lamps, 1)
     if files := _files(options.test_meshes, find_meshes, file_sources):
         sets["meshes"] = pair_up(files, spread(maps, len(files)) or skies, 1)
-    return pair_up(objects, lights, each), sets
+    seen = pair_up(objects, lights, each)
+    for unseen in sets.values():
+        check_unseen(seen, unseen)
+    return seen, sets
 
 
 def _files(path: Path | None, find: Callable, name: Callable) -> list[Any]:
@@ -84,7 +89,16 @@ def _files(path: Path | None, find: Callable, name: Callable) -> list[Any]:
 def paper_sources(
     options: LitOptions, objects: Sequence[Source], lights: Sequence[LightSource]
 ) -> tuple[list[Source], dict[str, list[Source]]]:
-    """The paper's split of these objects and lights; validation and test are unseen."""
+    """The paper's split of these objects and lights; test and validation are unseen.
+
+    Raises:
+        InputError: files to test on, which the split takes from the others.
+    """
+    if options.test_meshes or options.test_envmaps:
+        raise InputError(
+            "--split paper tests on parts of --meshes and --envmaps: leave out "
+            "--test-meshes and --test-envmaps"
+        )
     split = PAPER_SPLIT
     parts = split.train, split.validation, split.test
     objects_of = split_apart(objects, [count for count, _ in parts], options.seed)
@@ -93,4 +107,4 @@ def paper_sources(
         pair_up(o, lit, count)
         for o, lit, (_, count) in zip(objects_of, lights_of, parts, strict=True)
     )
-    return seen, {"validation": validation, "test": test}
+    return seen, {"test": test, "validation": validation}

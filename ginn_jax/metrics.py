@@ -100,6 +100,12 @@ def equal_tracing(
     return equal, float(start + slope * equal), float(single / affordable / error)
 
 
+def foreground(reference: Image) -> Mask:
+    """Pixels that hold something in a reference; all where none does."""
+    held = (reference.sum(-1) if reference.ndim == 3 else reference) > 0
+    return held | ~held.any()
+
+
 def tone_map(image: Image, reference: Image, mask: Mask | None = None) -> Image:
     """Linear [H W] or [H W 3] to display values in [0, 1], after the paper's appendix.
 

@@ -155,6 +155,20 @@ def origin_of(source: Source) -> dict[str, Any]:
     return found
 
 
+def check_unseen(seen: Sequence[Source], unseen: Sequence[Source]) -> None:
+    """Raise `InputError` where a file to test on, whatever its name, is trained on."""
+    known = {_contents(path) for path in _files(seen)}
+    for path in sorted(_files(unseen)):
+        if _contents(path) in known:
+            raise InputError(f"{path} is to be trained on as well: leave it out of one")
+
+
+def _files(sources: Sequence[Source]) -> set[str]:
+    """The files of objects and lights."""
+    named = [s.path for s in sources] + [s.light.path for s in sources if s.light]
+    return {path for path in named if path}
+
+
 def _contents(path: str) -> int:
     """A checksum of a file and, of a .gltf, of the files that hold its numbers."""
     try:

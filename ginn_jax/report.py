@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from ginn_jax.files import writing
-from ginn_jax.metrics import equal_tracing, tone_map
+from ginn_jax.metrics import equal_tracing, foreground, tone_map
 from ginn_jax.process import available_cores
 from ginn_jax.run_record import RESULTS
 
@@ -129,11 +129,11 @@ def beside_tracing(
     Traced rows, two at least, are those with the key `count`.
     """
     traced = [(r[count], r["mse_2d"], r["seconds"]) for r in rows if count in r]
-    if len(traced) < 2 or min(traced)[1] <= 0:
+    if len(traced) < 2 or not min(traced)[1] > 0:
         return list(rows)
 
     def beside(row: Mapping[str, Any]) -> Mapping[str, Any]:
-        if count in row or "denoised" in row or row["mse_2d"] <= 0:
+        if count in row or "denoised" in row or not row["mse_2d"] > 0:
             return row
         found = equal_tracing(row["mse_2d"], row["seconds"], traced)
         return {**row, **dict(zip(TRACING, found, strict=True))}
@@ -186,7 +186,7 @@ def draw_color_views(
     for row, (title, panels) in zip(grid, views, strict=True):
         for number, (axes, panel) in enumerate(zip(row, panels, strict=True)):
             reference = panels[number // 2 * 2]
-            axes.imshow(tone_map(panel, reference, reference.sum(-1) > 0))
+            axes.imshow(tone_map(panel, reference, foreground(reference)))
             axes.set_title(f"{title}: {names[number]}" if not number else names[number])
             axes.title.set_fontsize(8)
             axes.axis("off")

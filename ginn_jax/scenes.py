@@ -23,7 +23,7 @@ from ginn_jax.visible import visible_samples
 SCENES_PER_WORKER = 200
 # Raised where an effect's ground truth becomes another, so that what was made is not
 # taken for it.
-FORMATS = {"occlusion": 5, "illumination": 5, "scattering": 6}
+FORMATS = {"occlusion": 5, "illumination": 6, "scattering": 7}
 
 
 @dataclass(frozen=True)

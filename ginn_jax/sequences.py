@@ -13,10 +13,13 @@ from jaxtyping import Bool, Float, Int
 
 from ginn_jax.errors import InputError
 from ginn_jax.mesh import Mesh, add_ground, fit_unit_box
+from ginn_jax.orientation import turn_outward
 from ginn_jax.reference import build_scene
 from ginn_jax.samples import Samples
 from ginn_jax.shapes import random_shape
 from ginn_jax.visible import draw_reached, draw_sides
+
+UP = np.array([0.0, 1.0, 0.0])
 
 
 class Animation(NamedTuple):
@@ -94,9 +97,11 @@ def procedural_animation(seed: int, frames: int) -> Animation:
 def frames_of(animation: Animation, count: int, ground: bool) -> list[Mesh]:
     """`count` consecutive frames, all in the unit box of the whole animation.
 
-    The ground, if any, lies under the lowest vertex of all frames.
+    The ground, if any, lies under the lowest vertex of all frames. Closed parts that
+    are inside out in the first frame are turned, as those of a mesh are.
     """
-    places, faces = animation
+    places = animation.vertices
+    faces, _ = turn_outward(places[0], animation.faces)
     low, high = places.min(axis=(0, 1)), places.max(axis=(0, 1))
     scale = float((high - low).max())
     if not scale > 0:
@@ -140,13 +145,16 @@ def carried_samples(
 
 
 def samples_at(mesh: Mesh, carried: Carried) -> Samples:
-    """Where carried samples are in another frame."""
+    """Where carried samples are in another frame.
+
+    Those of a face without area there, which nothing sees, point up.
+    """
     corners = mesh.vertices[mesh.faces[carried.face]]
     position = np.einsum("nk,nkd->nd", carried.barycentric, corners)
     a, b, c = corners.transpose(1, 0, 2).astype(np.float64)
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal = normal / np.where(length > 0, length, 1.0)
+    normal = np.where(length > 0, normal / np.where(length > 0, length, 1.0), UP)
     normal = np.where(carried.behind[:, None], -normal, normal)
     material = mesh.material[carried.face].astype(np.int32)
     return Samples(position.astype(np.float32), normal.astype(np.float32), material)

@@ -30,12 +30,14 @@ def test_every_sequence_has_its_column_and_its_moving_image():
         "options": options,
         "frames": {"fox": 2, "frog": 3},
         "samples": 1234,
+        "command": "python -m experiments.animation --frames 2",
         "environment": {"processor": "some", "cores": 2},
     }
     text = write_report(metrics)
     assert "| ours | 0.5 (0.500) | 0.3 (0.075) |" in text
     assert "fox (2 frames), frog (3 frames)" in text
     assert "1234 samples" in text
+    assert "`python -m experiments.animation --frames 2`" in text
     assert "(fox/animation.gif)" in text
     assert "(frog/animation.gif)" in text
     one = write_report(metrics | {"sequences": {"fox": sequences["fox"]}})

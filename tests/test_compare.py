@@ -173,11 +173,16 @@ def test_light_is_compared_with_tracing_plain_and_denoised(tmp_path, monkeypatch
     assert counted[16]["mse_2d"] == pytest.approx(rows[OURS]["mse_2d"], rel=1e-3)
     assert counted[4]["mse_2d"] != counted[16]["mse_2d"]
     for row in counted.values():
-        parts = [row[f"seconds_{part}"] for part in ("network", "samples", "pixels")]
+        parts = "network", "sampling", "samples", "pixels"
+        parts = [row[f"seconds_{part}"] for part in parts]
         assert min(parts) > 0
         assert row["seconds"] == pytest.approx(sum(parts))
     text = (tmp_path / "out" / "report.md").read_text()
-    assert "With direct light counted" in text
+    assert "With samples and direct light counted" in text
+    assert f"`{found['command']}`, 1 unseen" in text
+    assert "--counts 2 --disks 0.75" in found["command"]
+    noise = found["results"][0]["noise_dssim"]
+    assert 0 < noise < rows["2 paths"]["dssim_2d"]
     results = {row["method"]: row for row in found["results"]}
     for name in (OURS, "2D only", "3D only"):
         assert results[name]["relative_mse_3d"] > 0

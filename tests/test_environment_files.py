@@ -48,14 +48,32 @@ def test_file_comes_back(tmp_path, ending):
         np.testing.assert_array_equal(found, pixels)
 
 
+def over_the_sphere(radiance):
+    """The mean over all directions, a row by the solid angle of its band."""
+    edges = np.cos(np.linspace(0, np.pi, len(radiance) + 1))
+    return -np.diff(edges) @ radiance.mean(axis=1, dtype=float) / 2
+
+
+def test_a_sun_overhead_is_averaged_down_by_what_it_covers():
+    pixels = np.zeros((1024, 64, 3), np.float32)
+    pixels[0, 7] = 1e5
+    light = make_environment(pixels)
+    assert light.radiance.shape == (256, 16, 3)
+    sun = over_the_sphere(pixels)
+    np.testing.assert_allclose(over_the_sphere(light.radiance), sun, rtol=1e-5)
+    # A quarter of the width, and of the cap, which goes with the square of its angle, a
+    # sixteenth.
+    assert light.radiance.max() == pytest.approx(1e5 / 4 / 16, rel=1e-3)
+
+
 @pytest.mark.parametrize("ending", [".hdr", ".exr"])
 def test_large_file_is_averaged_down_and_keeps_irradiance(tmp_path, ending):
     pixels = dim_with_sun(512)
     light = load_environment(write(tmp_path / f"a{ending}", pixels))
     assert light.radiance.shape == (256, 512, 3)
     rounding = 1e-2 if ending == ".hdr" else 1e-5
-    mean = pixels.mean(axis=(0, 1), dtype=float)
-    np.testing.assert_allclose(light.radiance.mean((0, 1)), mean, rtol=rounding)
+    whole = over_the_sphere(pixels)
+    np.testing.assert_allclose(over_the_sphere(light.radiance), whole, rtol=rounding)
     for toward in ((0, 1, 0), (1, 2, -3), (-1, -0.2, 0.3)):
         normal = np.array(toward) / np.linalg.norm(toward)
         before = irradiance_of(EnvironmentMap(pixels), normal)
@@ -72,7 +90,7 @@ def test_grey_file_has_three_equal_channels(tmp_path):
 @settings(max_examples=15)
 @given(st.integers(1, 40), st.integers(1, 80), st.data())
 def test_any_size_is_averaged_to_at_most_the_height(height, width, data):
-    """The mean over all pixels stays, and what is even stays even."""
+    """The mean over all directions stays, and what is even stays even."""
     elements = {"elements": st.sampled_from([0, 0.5, 1, 1e5]), "fill": st.just(1)}
     pixels = data.draw(hnp.arrays(np.float32, (height, width, 3), **elements))
     pixels[0, 0] = 1
@@ -83,9 +101,8 @@ def test_any_size_is_averaged_to_at_most_the_height(height, width, data):
     assert light.shape[0] == min(height, 8)
     if width == 2 * height:
         assert light.shape[1] == 2 * light.shape[0]
-    np.testing.assert_allclose(
-        light.mean((0, 1), dtype=float), pixels.mean((0, 1), dtype=float), rtol=1e-5
-    )
+    whole = over_the_sphere(pixels)
+    np.testing.assert_allclose(over_the_sphere(light), whole, rtol=1e-5)
     assert light.min() >= 0
     np.testing.assert_allclose(even, 3, rtol=1e-6)
 

@@ -12,7 +12,7 @@ import tiny
 from benchmarks import generation
 from benchmarks import relight as relight_benchmark
 from experiments import gi_train, sss_train
-from ginn_jax import blocks, evaluate_light, presets, scenes, train
+from ginn_jax import blocks, evaluate, evaluate_light, presets, scenes, train
 from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import LitCloud
 from ginn_jax.lit_options import LitOptions, choose_sources
@@ -139,10 +139,40 @@ def test_the_papers_split_says_what_it_lacks():
         choose_sources(options)
     seen, unseen = choose_sources(replace(options, shapes=1700))
     assert len(seen) == 1000 * 20
-    assert [len(s) for s in unseen.values()] == [200 * 5, 500 * 5]
+    assert {name: len(s) for name, s in unseen.items()} == {
+        "test": 500 * 5,
+        "validation": 200 * 5,
+    }
     lights = [{s.light.name for s in part} for part in (seen, *unseen.values())]
     assert not lights[0] & (lights[1] | lights[2])
     assert not lights[1] & lights[2]
+
+
+def test_the_papers_split_is_of_the_maps_that_are_given(tmp_path):
+    for i in range(30):
+        (tmp_path / f"map_{i}.hdr").write_bytes(b"one")
+    options = LitOptions(shapes=1700, split="paper", envmaps=tmp_path)
+    seen, unseen = choose_sources(options)
+    assert all(s.light.path for part in (seen, *unseen.values()) for s in part)
+    with pytest.raises(InputError, match=r"^--split paper tests on parts"):
+        choose_sources(replace(options, test_envmaps=tmp_path))
+
+
+def test_what_is_tested_on_is_not_trained_on(tmp_path):
+    """Known by its contents, whatever it is called."""
+    for folder, name, content in (
+        ("seen", "a.hdr", b"one"),
+        ("seen", "b.hdr", b"two"),
+        ("unseen", "c.hdr", b"three"),
+        ("again", "d.hdr", b"three"),
+        ("again", "e.hdr", b"two"),
+    ):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        (tmp_path / folder / name).write_bytes(content)
+    options = LitOptions(shapes=20, test_shapes=2, envmaps=tmp_path / "seen")
+    choose_sources(replace(options, test_envmaps=tmp_path / "unseen"))
+    with pytest.raises(InputError, match=r"again/e\.hdr is to be trained on as well"):
+        choose_sources(replace(options, test_envmaps=tmp_path / "again"))
 
 
 def cloud_of(light, seed=0):
@@ -178,6 +208,17 @@ def test_errors_are_in_units_of_light_and_free_of_noise():
     bright = encoded._replace(scale=1e4 * encoded.scale)
     again = evaluate_light.unit_errors(bright, cloud_of(1e4 * light), 5e3 * light)
     assert again["mse_3d"] == pytest.approx(exact["mse_3d"], abs=1e-5)
+
+
+def test_clouds_without_light_are_left_out_and_counted():
+    row = {"mse_3d": 0.5, "noise_floor_3d": 0.1, "variance_3d": 2.0}
+    row |= {"ray_variance": 8.0, "relative_mse_3d": 0.25}
+    dark = dict.fromkeys(row, float("nan"))
+    pooled = evaluate.pool_rows([row, dark, row])
+    assert (pooled["clouds"], pooled["dark_clouds"]) == (2, 1)
+    assert (pooled["relative_mse_3d"], pooled["equal_rays"]) == (0.25, 16.0)
+    with pytest.raises(InputError, match=r"^no light reaches any of the clouds"):
+        evaluate.pool_rows([dark])
 
 
 def test_unlit_channels_have_no_say():

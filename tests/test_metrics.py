@@ -168,6 +168,14 @@ def test_what_does_not_fit_is_refused(b, mask, message, unchecked):
             metric(np.zeros((12, 12)), b, mask)
 
 
+@pytest.mark.parametrize("shape", [(5, 4), (5, 4, 3)])
+def test_all_of_a_black_reference_counts(shape):
+    picture = np.zeros(shape)
+    assert metrics.foreground(picture).all()
+    picture[2, 1] = 1
+    assert np.argwhere(metrics.foreground(picture)).tolist() == [[2, 1]]
+
+
 def test_dssim_refuses_small_images():
     with pytest.raises(InputError, match="11 pixels"):
         metrics.dssim(np.zeros((10, 20)), np.zeros((10, 20)))

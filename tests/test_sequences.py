@@ -61,8 +61,22 @@ def test_a_sheet_is_sampled_on_both_sides_and_what_is_inside_out_outside():
         np.stack([ball.vertices] * 2).astype(np.float32), ball.faces[:, ::-1]
     )
     [mesh, _] = sequences.frames_of(inside_out, 2, ground=False)
-    samples = sequences.samples_at(mesh, sequences.carried_samples(mesh, 400, seed=0))
-    assert ((samples.position * samples.normal).sum(axis=1) > 0).all()
+    for both in (True, False):
+        carried = sequences.carried_samples(mesh, 400, both, seed=0)
+        samples = sequences.samples_at(mesh, carried)
+        assert ((samples.position * samples.normal).sum(axis=1) > 0).all()
+
+
+def test_samples_of_a_face_that_collapses_have_a_normal():
+    [mesh, _] = sequences.frames_of(DATA, 2, ground=False)
+    carried = sequences.carried_samples(mesh, 400, seed=0)
+    flat = mesh.vertices.copy()
+    flat[mesh.faces[carried.face[0]]] = flat[mesh.faces[carried.face[0], 0]]
+    samples = sequences.samples_at(mesh._replace(vertices=flat), carried)
+    length = np.linalg.norm(samples.normal, axis=1)
+    np.testing.assert_allclose(length, 1, atol=1e-4)
+    behind = -1 if carried.behind[0] else 1
+    np.testing.assert_array_equal(samples.normal[0], [0, behind, 0])
 
 
 def test_samples_of_nested_boxes_are_of_the_outermost_alone():
