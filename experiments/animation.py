@@ -124,7 +124,7 @@ def main(options: Options) -> dict[str, Any]:
         "frames": {name: len(meshes) for name, meshes in scenes.items()},
         "samples": settings.points,
         "command": command_line("experiments.animation", options),
-        "options": {k: str(v) for k, v in asdict(options).items()},
+        "options": asdict(options),
         "environment": report.environment(),
     }
     report.write_results(options.out, metrics, write_report(metrics))

@@ -116,7 +116,7 @@ def main(options: Options) -> dict[str, Any]:
             progress.advance(task)
     metrics = {
         "lights": rows,
-        "options": {k: str(v) for k, v in asdict(options).items()},
+        "options": asdict(options),
         "environment": report.environment(),
     }
     report.write_results(options.out, metrics, write_report(metrics))

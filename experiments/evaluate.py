@@ -243,7 +243,7 @@ def summary(
     metrics |= tables
     metrics |= {"objects": len(names), "names": names}
     metrics |= {"command": command_line("experiments.evaluate", options)}
-    metrics |= {"options": {k: str(v) for k, v in asdict(options).items()}}
+    metrics |= {"options": asdict(options)}
     metrics |= {"environment": report.environment()}
     return metrics | {"peak_memory_gib": report.peak_memory_gib()}
 

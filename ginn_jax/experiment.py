@@ -196,7 +196,7 @@ def closing(
         "skipped_steps": int(run.state.skipped),
         "limits": dict(run.limits.sizes),
         "limits_raised": run.raised,
-        "options": {k: str(v) for k, v in asdict(options).items()},
+        "options": asdict(options),
         "training": asdict(config),
         "environment": report.environment(),
     }

@@ -44,7 +44,7 @@ from ginn_jax.neighbors import bucket
 from ginn_jax.network import Variables
 from ginn_jax.process import ALONE
 from ginn_jax.receptive_field import Oriented
-from ginn_jax.searches import uniform_limits
+from ginn_jax.searches import uniform_limits, warn_of_gaps
 from ginn_jax.shading import (
     Encoded,
     Searched,
@@ -238,6 +238,7 @@ def shade_points(
     if 2 * size > largest_block(encoded.scale is not None):  # the next may be larger
         sufficed = fitted(sufficed, demands)
     say_raised(limits, sufficed)
+    warn_of_gaps(network.query, demands, len(position))
     channels = () if encoded.scale is None else encoded.scale.shape
     if not parts:
         return np.zeros((0, *channels), np.float32), sufficed

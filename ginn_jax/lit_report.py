@@ -66,8 +66,8 @@ of paths per point at which path tracing has the same MSE.
 
 Means over {len(m["error_against_time_rows"]) // len(m["error_against_time"])} unseen
 objects at {options["resolution"]} x {options["resolution"]}, RGB, same pixels, same
-machine, same run; compilation, G-buffer and direct light apart. The reference has
-{m["reference_paths"]} paths a pixel, whose noise is subtracted. DSSIM of what is
+machine, same run; compilation, G-buffer, samples and direct light apart. The reference
+has {m["reference_paths"]} paths a pixel, whose noise is subtracted. DSSIM of what is
 displayed, after the paper's tone mapping, over the foreground.
 
 {report.table_of(against, times | report.TRACING)}

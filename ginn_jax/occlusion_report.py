@@ -39,8 +39,8 @@ number of rays per point at which ray tracing has the same MSE.
 
 Means over {len(m["foreground_pixels"])} unseen objects at {options["resolution"]} x
 {options["resolution"]} ({", ".join(map(str, m["foreground_pixels"]))} foreground
-pixels), same pixels, same machine, same run; compilation and G-buffer apart. DSSIM
-after the paper's tone mapping, over the foreground.
+pixels), same pixels, same machine, same run; compilation, G-buffer and
+samples of the surface apart. DSSIM after the paper's tone mapping, over the foreground.
 
 {report.table_of(against, times | report.TRACING)}
 ![error against run time](error_against_time.png)

@@ -76,13 +76,13 @@ def steps_taken(metrics: Mapping[str, Any]) -> str:
     """How long a run trained, from which weights if not from new ones, and its seed."""
     options = metrics["options"]
     begun = options["start"]
-    trained_on = "" if begun == "None" else f" on the weights of {begun}"
+    trained_on = "" if begun is None else f" on the weights of {begun}"
     clouds = f"{metrics['steps']} steps of {options['batch']} clouds"
     return f"{clouds}{trained_on}, seed {options['seed']}"
 
 
 def _plain(value: Any) -> Any:
-    """NumPy and JAX numbers as JSON numbers."""
+    """NumPy and JAX numbers as JSON numbers, paths as text."""
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 

@@ -78,11 +78,11 @@ def test_a_run_of_damaged_records_is_not_exported(exported, tmp_path, content):
     assert not (tmp_path / "ao.npz").exists()
 
 
-@pytest.mark.parametrize("begun", ["None", "runs/first"])
+@pytest.mark.parametrize("begun", [None, "runs/first"])
 def test_what_training_began_with_is_told(exported, begun):
     folder, *_ = exported
     assert pretrained.load_manifest(folder)["ao"]["start"] == "runs/first"
-    options = {"batch": "2", "seed": "1", "start": begun}
+    options = {"batch": 2, "seed": 1, "start": begun}
     told = report.steps_taken({"steps": 30, "options": options})
     assert told.startswith("30 steps of 2 clouds")
     assert ("on the weights of runs/first" in told) == (begun == "runs/first")

@@ -1,5 +1,6 @@
 """Stiff and extreme input: what once lost digits, or all of them."""
 
+import warnings
 from dataclasses import replace
 from functools import cache, partial
 
@@ -12,7 +13,7 @@ import trimesh
 from benchmarks import stability, stability_cases, stability_stages
 from ginn_jax import dataset, hierarchy, image, inference, irradiance, train
 from ginn_jax.dataset import unit_light
-from ginn_jax.errors import InputError
+from ginn_jax.errors import InputError, InputWarning
 from ginn_jax.lighting import PointLight
 from ginn_jax.limits import Limits, raise_limits
 from ginn_jax.mesh import Mesh
@@ -121,6 +122,15 @@ def test_a_picture_far_away_has_the_edges_that_it_has_here(offset, monkeypatch):
     frame = codes, position, up, np.ones(x.shape, bool)
     found, _ = image.shade_image(network, LIMITS, {}, *frame, resolution_scale=0.5)
     np.testing.assert_allclose(found, upper, atol=1e-3)
+
+
+def test_a_cloud_in_other_units_is_told():
+    """Its points are all farther from each other than any receptive field is wide."""
+    with pytest.warns(InputWarning, match="lie 1 points .* fit the object into the un"):
+        shaded(100 * CLOUD.position.astype(np.float64))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", InputWarning)
+        shaded(CLOUD.position.astype(np.float64))
 
 
 def test_clouds_of_a_batch_are_counted_from_their_middle():
