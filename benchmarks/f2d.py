@@ -36,7 +36,6 @@ from ginn_jax.searches import uniform_limits
 from ginn_jax.train import init_state
 from ginn_jax.visible import visible_samples
 
-UNSEEN_SEED = 20_000_000
 # The paper's AO, whole network, 1024 x 1024, NVIDIA GTX 1080.
 PAPER_MS = 43.3
 
@@ -75,7 +74,7 @@ QUICK |= {"scales": (0.5,), "repeats": 2}
 
 def make_frame(options: Options) -> tuple[Scene, GBuffer]:
     """An object on its ground plane, and what a camera sees of it."""
-    source = objects.procedural_sources(1, UNSEEN_SEED)[0]
+    source = objects.procedural_sources(1, objects.BENCHMARK_SEED)[0]
     if options.mesh is not None:
         source = objects.file_sources(find_meshes(options.mesh))[0]
     scene = reference.build_scene(objects.load_object(source))

@@ -24,8 +24,6 @@ from ginn_jax.reference import OFFSET, build_scene, columns
 from ginn_jax.renderer import use_mitsuba
 from ginn_jax.visible import visible_samples
 
-UNSEEN_SEED = 20_000_000
-
 
 @dataclass(frozen=True)
 class Options:
@@ -108,8 +106,8 @@ def main(options: Options) -> dict[str, Any]:
     require(options, {"scenes": 1, "points": 100, "paths": 2, "repeats": 1})
     begin = time.perf_counter()
     count = options.scenes
-    shapes = objects.procedural_sources(count, UNSEEN_SEED)
-    lights = objects.procedural_lights(count, UNSEEN_SEED)
+    shapes = objects.procedural_sources(count, objects.BENCHMARK_SEED)
+    lights = objects.procedural_lights(count, objects.BENCHMARK_SEED)
     rows = [compare(options, s) for s in pair_up(shapes, lights, 1)]
     metrics = {"rows": rows} | circumstances(options, begin)
     heads = {"scene": "scene", "bare": "Mitsuba M paths/s", "ours": "ours M paths/s"}

@@ -30,8 +30,6 @@ from ginn_jax.relight import prepare_relighting, relight
 from ginn_jax.samples import Samples
 from ginn_jax.visible import visible_samples
 
-UNSEEN_SEED = 20_000_000
-
 
 @dataclass(frozen=True)
 class Options:
@@ -57,7 +55,7 @@ QUICK = {"resolution": 64, "points": 4000, "repeats": 2, "networks": ("gi",)}
 def lit_pair(options: Options, network: Network) -> tuple[LitCloud, LitCloud]:
     """A cloud and the foreground pixels of a frame, in random light."""
     scatters = network.materials == 3
-    source = objects.procedural_sources(1, UNSEEN_SEED)[0]
+    source = objects.procedural_sources(1, objects.BENCHMARK_SEED)[0]
     scene = reference.build_scene(objects.load_object(source, ground=not scatters))
     size = options.resolution
     seen = reference.render_gbuffer(scene, orbit_camera(width=size, height=size))

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.f2d import UNSEEN_SEED, block_memory
+from benchmarks.f2d import block_memory
 from benchmarks.timing import Timing, circumstances, describe, measure
 from ginn_jax import image, inference, objects, reference, report
 from ginn_jax.architecture import Network
@@ -127,7 +127,7 @@ def main(options: Options) -> dict[str, Any]:
     require_some(options, "points", "resolutions", least=2)
     begin = time.perf_counter()
     scene = reference.build_scene(
-        objects.load_object(objects.procedural_sources(1, UNSEEN_SEED)[0])
+        objects.load_object(objects.procedural_sources(1, objects.BENCHMARK_SEED)[0])
     )
     tables = {
         "points": over_points(options, scene),

@@ -150,7 +150,7 @@ def train(
             if not console.is_terminal and (note or step % 100 == 0):
                 console.print(f"step {step} of {config.steps}: {text}")
 
-        given = config, clouds, options.out, fit.Schedule(), tell, options.resume
+        given = config, clouds, options.out, fit.Intervals(), tell, options.resume
         run = fit.fit(*given, extra, weights)
     forget_programs()
     return run

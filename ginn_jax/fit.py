@@ -32,7 +32,7 @@ from ginn_jax.train import StepReport, TrainState, init_state, train_step
 
 
 @dataclass(frozen=True)
-class Schedule:
+class Intervals:
     """How often a run reports and saves, in steps."""
 
     report: int = 10
@@ -59,7 +59,7 @@ def fit(
     config: Training,
     clouds: Sequence[Cloud],
     folder: Path,
-    schedule: Schedule,
+    intervals: Intervals,
     progress: Progress,
     resume: bool = False,
     extra: dict[str, Any] | None = None,
@@ -99,9 +99,9 @@ def fit(
             continue
         compiled.add(used)
         history.append(loss)
-        if (step + 1) % schedule.report == 0:
-            progress(step + 1, recent_loss(history, schedule.report), "")
-        if (step + 1) % schedule.save == 0 or step + 1 == config.steps:
+        if (step + 1) % intervals.report == 0:
+            progress(step + 1, recent_loss(history, intervals.report), "")
+        if (step + 1) % intervals.save == 0 or step + 1 == config.steps:
             save_losses(folder, history)
             save_run(folder, config, room, extra, seconds, raised)
             save_state(manager, state)

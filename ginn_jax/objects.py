@@ -24,6 +24,8 @@ from ginn_jax.shapes import SHAPES, random_shape
 
 # Seeds of what is trained on lie below UNSEEN_SEED, `SEEDS_APART` for each --seed.
 SEEDS_APART, UNSEEN_SEED = 100_000, 10_000_000
+# Of what benchmarks measure on: neither trained nor tested on.
+BENCHMARK_SEED = 20_000_000
 
 
 @dataclass(frozen=True)

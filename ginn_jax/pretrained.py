@@ -101,7 +101,7 @@ def read_weights(path: Path, config: Training) -> Variables:
     """
     found = load_arrays(path, None, "install the package again")
     leaves, tree = jax.tree.flatten_with_path(state_shapes(config).variables)
-    wanted = {place(keys): leaf.shape for keys, leaf in leaves}
+    wanted = {tree_name(keys): leaf.shape for keys, leaf in leaves}
     if wanted != {name: array.shape for name, array in found.items()}:
         raise InputError(f"{path} holds another network: install the package again")
     values = [np.asarray(found[name], np.float32) for name in wanted]
@@ -110,7 +110,7 @@ def read_weights(path: Path, config: Training) -> Variables:
     return jax.tree.unflatten(tree, [jax.numpy.asarray(value) for value in values])
 
 
-def place(keys: Any) -> str:
+def tree_name(keys: Any) -> str:
     """Where an array stands in its tree, as a name."""
     return jax.tree_util.keystr(keys, simple=True, separator="/")
 
@@ -125,7 +125,7 @@ def export(run: Path, name: str, more: Record, folder: Path = FOLDER) -> Path:
     record = record_of(run, limits) | more
     folder.mkdir(parents=True, exist_ok=True)
     leaves, _ = jax.tree.flatten_with_path(variables)
-    arrays = {place(keys): np.asarray(leaf) for keys, leaf in leaves}
+    arrays = {tree_name(keys): np.asarray(leaf) for keys, leaf in leaves}
     save_arrays(folder / f"{name}.npz", arrays, {"name": name})
     manifest = load_manifest(folder)
     manifest[name] = record

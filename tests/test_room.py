@@ -47,7 +47,7 @@ def train(folder):
     notes = []
     with tiny.cheap_compiling(), jax.numpy_dtype_promotion("standard"):
         fit.train_step.clear_cache()
-        given = CONFIG, clouds(), folder, fit.Schedule(report=1, save=6)
+        given = CONFIG, clouds(), folder, fit.Intervals(report=1, save=6)
         found = fit.fit(*given, lambda step, loss, note: notes.append(note))
     return found, [n for n in notes if n], fit.train_step._cache_size()
 

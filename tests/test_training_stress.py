@@ -29,7 +29,7 @@ LIT = replace(tiny.ONE_LEVEL, lights=1, local=True)
 CONFIG = replace(
     tiny.CONFIG, network=LIT, points=POINTS, queries=32, steps=12, batch_size=1
 )
-OFTEN = fit.Schedule(report=1, save=3)
+OFTEN = fit.Intervals(report=1, save=3)
 
 
 def cloud(seed, light=1.0):
@@ -264,7 +264,7 @@ def test_training_on_nothing_is_refused(tmp_path, radius, sizes, message):
     optax = jax.numpy_dtype_promotion("standard")
     refused = pytest.raises(InputError, match=message)
     with tiny.cheap_compiling(), optax, refused:
-        fit.fit(config, clouds, tmp_path, fit.Schedule(), lambda *_: None)
+        fit.fit(config, clouds, tmp_path, fit.Intervals(), lambda *_: None)
 
 
 def test_progress_leaves_skipped_steps_out():
