@@ -7,7 +7,7 @@ writes NAME.npz and the record of the run, with the network's error on one fixed
 by which a test tells that the weights are the ones measured.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import jax
@@ -18,6 +18,7 @@ from ginn_jax import compare, evaluate, evaluate_light
 from ginn_jax.architecture import Network
 from ginn_jax.checkpoint import load_weights
 from ginn_jax.commandline import start
+from ginn_jax.dataset import count_asked
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model
 from ginn_jax.limits import Limits
@@ -81,6 +82,7 @@ def fixed_scene_error(
         given = network, limits, model, [cloud], [source.name]
         rows, _ = evaluate.evaluate_clouds(*given, FIXED_COUNT)
     else:
+        settings = replace(settings, targets=count_asked(FIXED_POINTS))
         source = pair_up([source], procedural_lights(1, BENCHMARK_SEED), 1)[0]
         given = network, limits, model, [lit_cloud(source, settings)], [source.name]
         rows, _ = evaluate_light.evaluate_lit_clouds(*given, settings)

@@ -195,11 +195,11 @@ def unbroken(tmp_path_factory):
     return folder
 
 
-# Four at random; then before a life's first checkpoint; while the second is written
+# Two at random; then before a life's first checkpoint; while the second is written
 # and the first is whole; with losses beyond the checkpoint; after steps that none has.
 RANDOM = random.Random(6)
 MOMENTS = [
-    (RANDOM.choice(("step", "files", "rename")), RANDOM.randint(1, 5)) for _ in range(4)
+    (RANDOM.choice(("step", "files", "rename")), RANDOM.randint(1, 5)) for _ in range(2)
 ]
 MOMENTS += [("rename", 3), ("writing.002", 2), ("files", 8), ("step", 8)]
 
