@@ -147,8 +147,8 @@ def write_report(options: Options, trained: Trained, metrics: evaluate.Row) -> s
 
 {metrics["rows"][0]["clouds"]} scenes, Poisson disk radii {trained[0].levels}. The
 network is given the first of the same samples, and asked at the first of the same other
-points; noise of the reference is subtracted. Relative: over the variance of the target,
-pooled over the scenes.
+points; noise of the reference ({options.reference} rays or paths) is subtracted.
+Relative: over the variance of the target, pooled over the scenes.
 
 {report.table_of(metrics["rows"], heads)}
 Most of the error with all samples is of

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ginn_jax.hierarchy import squared_lengths
 from ginn_jax.packets import Edges
-from ginn_jax.ranges import expand_ranges
+from ginn_jax.ranges import expand_ranges, tiles_holding
 from ginn_jax.voxels import morton_order
 
 TILE = 8192
@@ -68,7 +68,7 @@ def tile_size(edges: int) -> int:
 
 def tile_count(edges: int, count: Int[Array, ""]) -> Int[Array, ""]:
     """Tiles with real edges."""
-    return -(-jnp.minimum(count, edges) // tile_size(edges))
+    return tiles_holding(jnp.minimum(count, edges), tile_size(edges))
 
 
 def kernel_inputs(

@@ -157,8 +157,9 @@ def relight(
     shared = everywhere(({"shader": variables["shader"]}, lit))
     check_prepared("queries", queries, *(t.asking.queries.mask for t in ready.turns))
     size = block_size(len(queries.position), lit=True)
-    asked = network_numbers(queries) if network.asks == "all" else (None, None)
+    asked: tuple[Any, Any] = None, None
     if network.asks == "all":
+        asked = network_numbers(queries)
         count = len(queries.position)
         numbers_of("material of queries", asked[0], network.materials, count)
         numbers_of("light of queries", asked[1], network.lights, count, least=0.0)
