@@ -37,6 +37,7 @@ from ginn_jax.compare_networks import (
     mean_picture,
     network_memory,
     network_picture,
+    other_runs,
     points_given,
 )
 from ginn_jax.compare_screen import screen_pictures
@@ -48,8 +49,6 @@ from ginn_jax.objects import Source
 from ginn_jax.scenes import Settings, cloud_origin
 from ginn_jax.upsample import shading_step
 
-TITLES = {"ao": "Ambient occlusion", "gi": "Global illumination"}
-TITLES |= {"sss": "Subsurface scattering"}
 TARGET_PATHS = 1024
 
 
@@ -67,6 +66,9 @@ class Options:
     """The same of the 2D-only network."""
     only_3d: Path | None = None
     """The same of the 3D-only network."""
+    beside: tuple[Path, ...] = ()
+    """The --out of runs of other networks of the effect, as of another width: beside
+    ours where error is compared with run time."""
     meshes: Path | None = None
     """A mesh file or a folder of unseen meshes; left out, procedural shapes."""
     envmaps: Path | None = None
@@ -132,6 +134,7 @@ def main(options: Options) -> dict[str, Any]:
     clouds = make(console, "clouds", sources, settings, options.out / "clouds")
     at_points, networks = errors_at_points(networks, clouds, sources, settings)
     networks |= disk_variants(networks[OURS], options.disks)
+    networks |= other_runs(options.effect, settings, options.beside, key=key)
     found = []
     for source, cloud in zip(sources, clouds, strict=True):
         console.print(f"{source.name}")
@@ -147,7 +150,7 @@ def main(options: Options) -> dict[str, Any]:
     compare_figures.draw_methods(options.out / "ablation.png", shown[:4])
     lines = metrics["error_against_time"], metrics["light_counted"]
     compare_figures.draw_front(options.out / "error_against_time.png", *lines)
-    text = compare_report.write_report(TITLES[options.effect], metrics)
+    text = compare_report.write_report(metrics)
     report.write_results(options.out, metrics, text)
     lost = len(metrics["lost_cells"])
     console.print(f"{lost} cells lost: {options.out / 'report.md'}")
@@ -240,11 +243,9 @@ def summary(
         "counted_rows": [row for scene in found for row in scene.counted],
     }
     metrics = compare_report.summary(options.effect, at_points, *tables.values())
-    metrics |= tables
-    metrics |= {"objects": len(names), "names": names}
+    metrics |= tables | {"objects": len(names), "names": names}
     metrics |= {"command": command_line("experiments.evaluate", options)}
-    metrics |= {"options": asdict(options)}
-    metrics |= {"environment": report.environment()}
+    metrics |= {"options": asdict(options), "environment": report.environment()}
     return metrics | {"peak_memory_gib": report.peak_memory_gib()}
 
 

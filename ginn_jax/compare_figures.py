@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from ginn_jax import report
-from ginn_jax.compare_networks import OURS
+from ginn_jax.compare_networks import OTHER, OURS
 from ginn_jax.evaluate import Row
 from ginn_jax.metrics import foreground, tone_map
 
@@ -27,6 +27,7 @@ def draw_front(path: Path, rows: list[Row], counted: Sequence[Row]) -> None:
         f"{OURS}, mean of draws": means,
         f"{OURS}, codes kept": [r for r in mine if "kept" in r],
         f"{OURS}, light counted": list(counted),
+        "other runs": [r for r in rows if r["method"].startswith(OTHER)],
         "ablations": [r for r in rows if r["method"] in ("2D only", "3D only")],
         "screen space": [
             r for r in rows if r["method"] in ("screen space", "visibility bitmask")
@@ -41,7 +42,7 @@ def draw_front(path: Path, rows: list[Row], counted: Sequence[Row]) -> None:
 def _short(row: Row) -> Row:
     """A row whose label leaves out what its line in the figure says."""
     name = row["method"].removesuffix(", denoised").removesuffix(", codes kept")
-    name = name.removeprefix(f"{OURS}, ")
+    name = name.removeprefix(f"{OURS}, ").removeprefix(OTHER)
     return row | {"method": name}
 
 

@@ -31,6 +31,7 @@ from ginn_jax.scenes import Occlusion, Settings
 Trained = tuple[Network, Limits, Model]
 
 OURS = "ours"
+OTHER = "run "
 NETWORKS = {OURS: "", "2D only": "_only_2d", "3D only": "_only_3d"}
 
 
@@ -103,6 +104,21 @@ def check_radius(name: str, data: dict[str, Any], radius: float) -> None:
             f"{name} learned occlusion within {data.get('radius')}, not within "
             f"{radius}: give that as --radius, or train another"
         )
+
+
+def other_runs(
+    effect: str, settings: Settings, runs: Sequence[Path], *, key: Key[Array, ""]
+) -> dict[str, Trained]:
+    """Networks of other finished runs of an effect, by the names of their folders.
+
+    Raises:
+        InputError: as `load_networks`, or two folders of one name.
+    """
+    names = [f"{OTHER}{run.resolve().name}" for run in runs]
+    if len(set(names)) < len(names):
+        raise InputError("two of the runs beside have one name: rename a folder")
+    found = (load_trained(effect, settings, run, key=key) for run in runs)
+    return dict(zip(names, found, strict=True))
 
 
 def points_given(cloud: Any) -> tuple[Any, np.ndarray | None]:

@@ -10,6 +10,8 @@ from ginn_jax.compare_networks import OURS
 from ginn_jax.evaluate import Row
 from ginn_jax.metrics import relative_error
 
+TITLES = {"ao": "Ambient occlusion", "gi": "Global illumination"}
+TITLES |= {"sss": "Subsurface scattering"}
 RIVALS = ("screen space", "visibility bitmask", "2D only", "3D only")
 CELLS = ("mse_3d", "mse_2d", "dssim_2d")
 KEPT = ("mse_3d", "relative_mse_3d", "equal_rays", "memory_mib")
@@ -88,7 +90,7 @@ def summary(
     }
 
 
-def write_report(title: str, m: Mapping[str, Any]) -> str:
+def write_report(m: Mapping[str, Any]) -> str:
     """report.md of a comparison."""
     env, options = m["environment"], m["options"]
     cells = {"method": "method", "shots": "shots", "mse_3d": "3D MSE"}
@@ -102,7 +104,7 @@ def write_report(title: str, m: Mapping[str, Any]) -> str:
     lost = "\n".join(f"- {line}" for line in m["lost_cells"]) or "None."
     ours = next(row for row in m["results"] if row["method"] == OURS)
     denoiser = "" if m["denoiser"] else " Open Image Denoise was not installed."
-    return f"""# {title}
+    return f"""# {TITLES[options["effect"]]}
 
 `{m["command"]}`, {m["objects"]} unseen
 scenes, {options["views"]} views each at {options["resolution"]} x

@@ -15,13 +15,14 @@ from hypothesis import strategies as st
 from experiments import evaluate as experiment
 from ginn_jax import blocks, checkpoint, report, run_record, scenes
 from ginn_jax.compare_figures import inset_place
-from ginn_jax.compare_networks import OURS, redrawn
+from ginn_jax.compare_networks import OURS, other_runs, redrawn
 from ginn_jax.compare_report import (
     RIVALS,
     lost_cells,
     pareto_front,
     pool_shots,
 )
+from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model
 
 numbers = st.floats(1e-3, 1e3)
@@ -126,6 +127,13 @@ def test_draws_are_distinct_and_none_is_the_networks_own():
     assert len(keys) == len(set(keys)) == 3
 
 
+def test_runs_beside_need_names_of_their_own(tmp_path):
+    runs = [tmp_path / "one" / "wide", tmp_path / "two" / "wide"]
+    settings = scenes.Occlusion(2000, 8, radius=0.1)
+    with pytest.raises(InputError, match="one name"):
+        other_runs("ao", settings, runs, key=jax.random.key(0))
+
+
 @pytest.mark.usefixtures("small_blocks")
 def test_light_is_compared_with_tracing_plain_and_denoised(tmp_path, monkeypatch):
     """By a denoiser that leaves the image as it is."""
@@ -198,6 +206,7 @@ def test_comparison_ends_in_a_report_and_keeps_its_references(tmp_path):
         checkpoint=run,
         only_2d=run,
         only_3d=run,
+        beside=(run,),
         objects=1,
         views=1,
         resolution=48,
@@ -212,6 +221,8 @@ def test_comparison_ends_in_a_report_and_keeps_its_references(tmp_path):
     assert names == ["screen space", "visibility bitmask", OURS, "2D only", "3D only"]
     traced = {r["method"]: r for r in first["error_against_time"] if "traced" in r}
     assert traced["4 rays"]["mse_2d"] < traced["1 rays"]["mse_2d"]
+    front = {row["method"]: row for row in first["error_against_time"]}
+    assert front["run run"]["mse_2d"] == front[OURS]["mse_2d"]
     text = (tmp_path / "out" / "report.md").read_text()
     assert all(name in text for name in (*names, "rays of equal MSE"))
     errors = {row["method"]: row["mse_2d"] for row in first["results"]}
