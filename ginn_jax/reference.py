@@ -68,11 +68,9 @@ def ambient_occlusion(
     scene = mesh if isinstance(mesh, Scene) else build_scene(mesh)
     _check_rays(points, normals, radius, rays, seed)
     _check_radius(scene, radius)
-    blocked = [
-        _count_blocked(scene, *launch, radius, rays, seed)
-        for launch in launches(points, normals, rays, RAYS_PER_LAUNCH)
-    ]
-    p = 1 - np.concatenate([np.zeros(0), *blocked]) / rays
+    number = np.arange(len(points), dtype=np.uint32)
+    blocked = count_blocked(scene, points, normals, number, radius, (0, rays), seed)
+    p = 1 - blocked / rays
     variance = p * (1 - p) / (rays - 1) if rays > 1 else np.full_like(p, np.nan)
     return Estimate(p.astype(np.float32), variance.astype(np.float32))
 
@@ -111,16 +109,38 @@ def build_scene(mesh: Mesh) -> Scene:
         return Scene(mesh, mi.load_dict({"type": "scene", "mesh": shape}))
 
 
-def _count_blocked(
+def count_blocked(
+    scene: Scene,
+    points: Float[np.ndarray, "N 3"],
+    normals: Float[np.ndarray, "N 3"],
+    number: UInt[np.ndarray, "N"],
+    radius: float,
+    cast: tuple[int, int],
+    seed: int,
+) -> UInt[np.ndarray, "N"]:
+    """How many of each point's rays hit something within `radius`.
+
+    The rays of a point depend on its `number` and `seed`; those `cast` are from the
+    first number to before the second.
+    """
+    each = max(cast[1] - cast[0], 1)
+    parts = []
+    for place, normal, i in launches(points, normals, each, RAYS_PER_LAUNCH):
+        own = number[i : i + len(place)]
+        parts.append(_count_of_launch(scene, place, normal, own, radius, cast, seed))
+    return np.concatenate([np.zeros(0, np.uint32), *parts])
+
+
+def _count_of_launch(
     scene: Scene,
     points: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
-    first: int,
+    number: UInt[np.ndarray, "n"],
     radius: float,
-    rays: int,
+    cast: tuple[int, int],
     seed: int,
 ) -> UInt[np.ndarray, "n"]:
-    """How many of each point's rays hit within `radius`; `first` numbers the points.
+    """`count_blocked` of as many points as are taken at a time.
 
     One lane a ray, so that the rays of a point are traced side by side. Numbers that
     change between calls are opaque, or each would compile a kernel of its own.
@@ -128,22 +148,23 @@ def _count_blocked(
     mi, variant = use_mitsuba()
     import drjit as dr
 
+    rays = cast[1] - cast[0]
     largest = float(np.abs(scene.mesh.vertices).max())
     offset = min(OFFSET * largest, 0.01 * radius)
     start = np.asarray(points, np.float32) + np.float32(offset) * normals
     with mi.variant_context(variant):
         lane = dr.arange(mi.UInt32, len(points) * rays)
         point = lane // dr.opaque(mi.UInt32, rays)
-        ray = lane - point * dr.opaque(mi.UInt32, rays)
-        number = point + dr.opaque(mi.UInt32, first)
-        a, b = random_pair(number, ray, dr.opaque(mi.UInt32, seed))
+        ray = lane - point * dr.opaque(mi.UInt32, rays) + dr.opaque(mi.UInt32, cast[0])
+        own = dr.gather(mi.UInt32, mi.UInt32(number), point)
+        a, b = random_pair(own, ray, dr.opaque(mi.UInt32, seed))
         square = mi.Point2f(mi.Float(a >> 8) * 2**-24, mi.Float(b >> 8) * 2**-24)
         hemisphere = mi.warp.square_to_cosine_hemisphere(square)
         normal = dr.gather(mi.Normal3f, mi.Normal3f(columns(normals)), point)
         origin = dr.gather(mi.Point3f, mi.Point3f(columns(start)), point)
-        cast = mi.Ray3f(origin, mi.Frame3f(normal).to_world(hemisphere))
-        cast.maxt = dr.opaque(mi.Float, radius)
-        blocked = dr.select(scene.handle.ray_test(cast), mi.UInt32(1), mi.UInt32(0))
+        shot = mi.Ray3f(origin, mi.Frame3f(normal).to_world(hemisphere))
+        shot.maxt = dr.opaque(mi.Float, radius)
+        blocked = dr.select(scene.handle.ray_test(shot), mi.UInt32(1), mi.UInt32(0))
         return dr.block_reduce(dr.ReduceOp.Add, blocked, rays).numpy()
 
 

@@ -10,11 +10,15 @@ from jaxtyping import Bool, Int
 
 from ginn_jax.errors import InputError
 from ginn_jax.mesh import Mesh
-from ginn_jax.reference import Scene, ambient_occlusion
+from ginn_jax.reference import Scene, count_blocked
 from ginn_jax.samples import Samples, sample_surface
 
 Rows = TypeVar("Rows")
 FAR, PROBE_RAYS = 100.0, 32
+# Rays that tell of most samples that light reaches them.
+FEW = 4
+# Samples are looked at in parts of what is wanted, until there are enough.
+PARTS = 2
 OBJECT = 0  # the material of what stands on the ground
 
 
@@ -53,9 +57,9 @@ def draw_reached(
     drawn = 5 * count // 2
     for _ in range(5):
         rows, samples = draw(drawn)
-        seen = reached_by_light(scene, samples, seed)
-        if len(seen) >= count:
-            return jax.tree.map(partial(np.take, indices=seen[:count], axis=0), rows)
+        seen = reached_by_light(scene, samples, count, seed)
+        if len(seen) == count:
+            return jax.tree.map(partial(np.take, indices=seen, axis=0), rows)
         drawn = 2 * drawn
     raise InputError("nearly all of the mesh's surface is sealed inside it: mend it")
 
@@ -80,8 +84,29 @@ def draw_sides(
     return behind, ~behind | (material == OBJECT)
 
 
-def reached_by_light(scene: Scene, samples: Samples, seed: int) -> Int[np.ndarray, "K"]:
-    """The samples from which at least one of `PROBE_RAYS` rays leaves the scene."""
-    ends = samples.position, samples.normal
-    sky = ambient_occlusion(scene, *ends, FAR, rays=PROBE_RAYS, seed=seed)
-    return np.flatnonzero(sky.mean > 0)
+def reached_by_light(
+    scene: Scene, samples: Samples, count: int, seed: int
+) -> Int[np.ndarray, "K"]:
+    """The first `count` samples, or fewer where there are, from which at least one of
+    `PROBE_RAYS` rays leaves the scene."""
+    found, size = np.zeros(0, np.int64), -(-count // PARTS)
+    for first in range(0, len(samples.position), size):
+        rows = np.arange(first, min(first + size, len(samples.position)))
+        found = np.append(found, rows[is_reached(scene, samples, rows, seed)])
+        if len(found) >= count:
+            break
+    return found[:count]
+
+
+def is_reached(
+    scene: Scene, samples: Samples, rows: Int[np.ndarray, "K"], seed: int
+) -> Bool[np.ndarray, "K"]:
+    """Whether light reaches these rows: all rays are cast where the first few fail."""
+    reached, doubtful = np.zeros(len(rows), bool), np.arange(len(rows))
+    for cast in ((0, FEW), (FEW, PROBE_RAYS)):
+        some = rows[doubtful]
+        ends = samples.position[some], samples.normal[some], some.astype(np.uint32)
+        blocked = count_blocked(scene, *ends, FAR, cast, seed)
+        reached[doubtful] = blocked < cast[1] - cast[0]
+        doubtful = np.flatnonzero(~reached)
+    return reached

@@ -4,14 +4,15 @@ import sys
 
 import numpy as np
 import pytest
+import rooms
 import tiny
 import trimesh
 
-from ginn_jax import objects, scenes
+from ginn_jax import objects, scenes, visible
 from ginn_jax.dataset import load_cloud
 from ginn_jax.errors import InputError
 from ginn_jax.mesh import add_ground, make_mesh
-from ginn_jax.reference import build_scene
+from ginn_jax.reference import ambient_occlusion, build_scene
 from ginn_jax.shapes import random_shape
 from ginn_jax.visible import visible_samples
 
@@ -164,7 +165,7 @@ def test_workers_make_the_same_and_keep_what_is_done(sources, made, tmp_path):
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from ginn_jax import objects, scenes
+from ginn_jax import objects, scenes, visible
 
 if __name__ == "__main__":
     sources = objects.procedural_sources(3, 5)
@@ -256,6 +257,23 @@ def test_a_sheet_is_sampled_from_both_sides_and_the_ground_from_above():
     assert (one.normal[one.material == 0, 2] > 0.5).all()
     # As dense as the ground: a side has 1 of area, the ground 1.6 squared.
     assert ground.mean() == pytest.approx(2.56 / 4.56, abs=0.05)
+
+
+def test_few_rays_tell_what_all_would():
+    """In a well at whose bottom a few rays of a hundred leave."""
+    well = rooms.cup()
+    well = well._replace(vertices=well.vertices * np.float32([1, 4, 1]))
+    scene = build_scene(well)
+    samples = visible.sample_sides(well, 3000, 5, True)
+    ends = samples.position, samples.normal
+    cast = {"rays": visible.PROBE_RAYS, "seed": 5}
+    sky = ambient_occlusion(scene, *ends, visible.FAR, **cast).mean
+    wanted = np.flatnonzero(sky > 0)
+    assert np.count_nonzero((sky > 0) & (sky < 0.1)) > 100
+    assert len(wanted) < len(sky) - 100
+    for count in (len(wanted), 700):
+        found = visible.reached_by_light(scene, samples, count, 5)
+        np.testing.assert_array_equal(found, wanted[:count])
 
 
 def test_a_scene_that_is_sealed_is_refused(tmp_path):
