@@ -157,12 +157,8 @@ def load_weights(folder: Path) -> tuple[Training, Limits, Variables]:
     if not (folder / CHECKPOINTS).is_dir():
         raise InputError(f"{folder} holds no checkpoint yet: let its run go on")
     here = SingleDeviceSharding(jax.devices()[0])
-    like = jax.tree.map(
-        lambda s: jax.ShapeDtypeStruct(s.shape, s.dtype, sharding=here),
-        state_shapes(config),
-    )
     with closing(open_reader(folder)) as manager:
-        state = restore_state(manager, like)
+        state = restore_state(manager, state_shapes(config, here))
     if state is None:
         raise InputError(f"{folder} holds no checkpoint yet: let its run go on")
     return config, limits, state.variables

@@ -24,7 +24,7 @@ from ginn_jax.geometry import Geometry, build_geometry, build_query_field
 from ginn_jax.limits import Demands, Limits
 from ginn_jax.ranges import compact
 from ginn_jax.receptive_field import Field, Oriented
-from ginn_jax.voxels import morton_order
+from ginn_jax.voxels import build_grid, morton_order
 
 
 class Asked(NamedTuple):
@@ -86,6 +86,32 @@ def thin_and_search(
     asked = queries_asked(network, asking, *numbers(cloud, rows, real, facets))
     example = Example(geometry, given, field, asking, asked, cloud.target[rows])
     return example, demands | near | more
+
+
+def blank_example(network: Network) -> Example:
+    """One point, one query and one edge of everything: what parameters need to begin.
+
+    Neither their shapes nor their values depend on any cloud.
+    """
+    place, row = jnp.zeros((1, 3)), jnp.zeros(1, jnp.int32)
+    point = Oriented(place, place, jnp.ones(1, bool))
+    inputs = jnp.zeros((7 if network.oriented else 3, 1))
+    field = Field(row, row, inputs, jnp.zeros(1), jnp.int32(1))
+    fields = {conv.name: field for conv in network.encoder}
+    grid = build_grid(place, point.mask, jnp.float32(1))
+    levels = (point,) * len(network.levels)
+    material, light = (
+        jnp.zeros((1, width)) if width else None
+        for width in (network.materials, network.lights)
+    )
+    return Example(
+        Geometry(levels, row, fields, None, grid),
+        points_asked(point, material, light),
+        field,
+        point,
+        queries_asked(network, point, material, light),
+        jnp.zeros(1),
+    )
 
 
 def given_share(

@@ -28,7 +28,14 @@ from ginn_jax.process import forget_programs
 from ginn_jax.recipe import Training
 from ginn_jax.room import Room, training_room, with_more
 from ginn_jax.run_record import UNSPENT, load_run, save_run
-from ginn_jax.train import StepReport, TrainState, init_state, train_step
+from ginn_jax.train import (
+    StepReport,
+    TrainState,
+    init_state,
+    on_devices,
+    state_shapes,
+    train_step,
+)
 
 
 @dataclass(frozen=True)
@@ -82,7 +89,8 @@ def fit(
         room, seconds, raised = training_room(config, clouds), dict(UNSPENT), {}
         save_run(folder, config, room, extra, seconds)
     manager = open_manager(folder, fresh=not resume)
-    state, history = latest(manager, folder, init_state(config, weights), resume)
+    found = latest(manager, config, folder) if resume else None
+    state, history = found or (init_state(config, weights), [])
     seconds["compile"] += time.perf_counter() - begin
     compiled = set[Limits]()
     while (step := int(state.step)) < config.steps:
@@ -110,12 +118,13 @@ def fit(
 
 
 def latest(
-    manager: ocp.CheckpointManager, folder: Path, state: TrainState, resume: bool
-) -> tuple[TrainState, list[float]]:
-    """The newest state of a run that goes on, else `state`; the losses up to there."""
-    if resume and (found := restore_state(manager, state)) is not None:
-        return found, load_losses(folder, int(found.step)).tolist()
-    return state, []
+    manager: ocp.CheckpointManager, config: Training, folder: Path
+) -> tuple[TrainState, list[float]] | None:
+    """The newest state of a run and its losses up to there; None before the first."""
+    state = restore_state(manager, state_shapes(config, on_devices(config)))
+    if state is None:
+        return None
+    return state, load_losses(folder, int(state.step)).tolist()
 
 
 def step_with_room(

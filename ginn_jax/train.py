@@ -4,7 +4,7 @@ The step draws rotations, thins the clouds, builds the hierarchy, searches, weig
 convolves, differentiates and updates. A batch is shared out between the devices.
 """
 
-from functools import cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -12,17 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.sharding import Mesh as DeviceMesh
-from jax.sharding import NamedSharding, PartitionSpec
+from jax.sharding import NamedSharding, PartitionSpec, Sharding
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ginn_jax.dataset import ShadedPoints
-from ginn_jax.example import Example, thin_and_search
+from ginn_jax.example import Example, blank_example, thin_and_search
 from ginn_jax.limits import Demands, Limits, fits
 from ginn_jax.network import Variables
 from ginn_jax.objective import batch_loss, init_variables, split_variables
 from ginn_jax.process import ALONE
 from ginn_jax.recipe import Training, make_optimizer
-from ginn_jax.searches import uniform_limits
 
 
 class TrainState(NamedTuple):
@@ -122,22 +121,22 @@ def make_example(
 def init_state(config: Training, variables: Variables | None = None) -> TrainState:
     """The state before the first step, of these weights or, by default, random ones."""
     if variables is None:
-        shapes, key = _example_shapes(config), jax.random.key(config.seed)
-        zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
-        variables = jax.jit(partial(init_variables, config.network))(zeros, key=key)
+        given, key = blank_example(config.network), jax.random.key(config.seed)
+        variables = jax.jit(partial(init_variables, config.network))(given, key=key)
     # A step gives its state's memory away: not that of whoever gave the weights.
     return place(config, _first_state(config, jax.tree.map(jnp.array, variables)))
 
 
-def state_shapes(config: Training) -> TrainState:
-    """Shapes and types of a state, without any computation."""
-    return jax.eval_shape(
-        lambda example, key: _first_state(
-            config, init_variables(config.network, example, key=key)
-        ),
-        _example_shapes(config),
-        jax.random.key(0),
-    )
+def state_shapes(config: Training, where: Sharding | None = None) -> TrainState:
+    """Shapes and types of a state that lies there, without any computation."""
+
+    def first(key: Key[Array, ""]) -> TrainState:
+        example = blank_example(config.network)
+        return _first_state(config, init_variables(config.network, example, key=key))
+
+    shapes = jax.eval_shape(first, jax.random.key(0))
+    there = partial(jax.ShapeDtypeStruct, sharding=where)
+    return jax.tree.map(lambda leaf: there(leaf.shape, leaf.dtype), shapes)
 
 
 def _first_state(config: Training, variables: Variables) -> TrainState:
@@ -146,26 +145,14 @@ def _first_state(config: Training, variables: Variables) -> TrainState:
     return TrainState(variables, optimizer, jnp.int32(0), jnp.int32(0))
 
 
-@cache
-def _example_shapes(config: Training) -> Example:
-    """Shapes of what a step computes from the clouds, in the smallest capacities."""
-    limits = uniform_limits(config.network, 64)
-    rows = (config.batch_size, config.points)
-
-    def array(width: int) -> Any:
-        return jax.ShapeDtypeStruct((*rows, width), jnp.float32) if width else None
-
-    number = jax.ShapeDtypeStruct(rows, jnp.float32)
-    more = array(config.network.materials), array(config.network.lights)
-    batch = ShadedPoints(array(3), array(3), number, number, *more)  # type: ignore[arg-type]
-    example = partial(make_example, config, limits, key=jax.random.key(0))
-    return jax.eval_shape(example, batch)[0]
-
-
 def place(config: Training, state: TrainState) -> TrainState:
     """The state on every device that shares a batch, as the step returns it."""
-    everywhere = NamedSharding(batch_mesh(config.batch_size), PartitionSpec())
-    return jax.device_put(state, everywhere)
+    return jax.device_put(state, on_devices(config))
+
+
+def on_devices(config: Training) -> NamedSharding:
+    """A copy on every device that shares a batch."""
+    return NamedSharding(batch_mesh(config.batch_size), PartitionSpec())
 
 
 @partial(jax.jit, static_argnums=(0, 1))

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from ginn_jax import example, train
 from ginn_jax.geometry import Geometry
+from ginn_jax.objective import init_variables
 from ginn_jax.receptive_field import Oriented
 
 
@@ -51,6 +52,25 @@ def test_queries_lie_beside_the_finest_level(sparsest):
     centred = position - np.outer(turned, [4, 0, 0])
     exact = tiny.exact_openness(centred, np.array(queries.normal))
     np.testing.assert_allclose(made.target, exact, atol=1e-4)
+
+
+@pytest.mark.parametrize("more", [{}, {"lights": 1, "materials": 3, "asks": "all"}])
+def test_parameters_begin_alike_whatever_the_cloud(more):
+    """Those of a blank example are those of a real one, bit for bit."""
+    network = replace(tiny.ONE_LEVEL, **more)
+    config = replace(tiny.CONFIG, network=network)
+    build = partial(train.make_example, config, tiny.ONE_LEVEL_LIMITS)
+    wide = {"lights": "light", "materials": "material"}
+    numbers = {
+        wide[n]: np.ones((2, 1200, w), np.float32) for n, w in more.items() if n in wide
+    }
+    init = jax.jit(partial(init_variables, network, key=jax.random.key(4)))
+    with tiny.cheap_compiling():
+        made, _ = jax.jit(build)(
+            tiny.batch()._replace(**numbers), key=jax.random.key(3)
+        )
+        assert made.geometry.levels[0].mask.sum() > 100
+        assert tiny.identical(init(made), init(example.blank_example(network)))
 
 
 @given(
