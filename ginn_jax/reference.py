@@ -66,8 +66,7 @@ def ambient_occlusion(
     unit vectors of the surface the points lie on. Raises `InputError` on bad input.
     """
     scene = mesh if isinstance(mesh, Scene) else build_scene(mesh)
-    _check_rays(points, normals, radius, rays, seed)
-    _check_radius(scene, radius)
+    check_cast(scene, points, normals, radius, rays, seed)
     number = np.arange(len(points), dtype=np.uint32)
     blocked = count_blocked(scene, points, normals, number, radius, (0, rays), seed)
     p = 1 - blocked / rays
@@ -220,16 +219,14 @@ def columns(rows: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 n"]:
     return np.ascontiguousarray(np.asarray(rows, np.float32).T)
 
 
-def _check_rays(points: Any, normals: Any, radius: float, rays: int, seed: int) -> None:
-    """Raise `InputError` unless these can be cast."""
+def check_cast(
+    scene: Scene, points: Any, normals: Any, radius: float, rays: int, seed: int
+) -> None:
+    """Raise `InputError` unless such rays can be cast in the scene."""
     unit_rows(points, normals)
     positive("radius", radius)
     whole("rays", rays, 1, RAYS_PER_LAUNCH)
     whole("seed", seed, 0, LARGEST_SEED)
-
-
-def _check_radius(scene: Scene, radius: float) -> None:
-    """Raise `InputError` for a radius that float32 coordinates do not resolve."""
     largest = float(np.abs(scene.mesh.vertices).max())
     if radius < LEAST_RADIUS * largest:
         raise InputError(

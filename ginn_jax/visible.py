@@ -10,7 +10,7 @@ from jaxtyping import Bool, Int
 
 from ginn_jax.errors import InputError
 from ginn_jax.mesh import Mesh
-from ginn_jax.reference import Scene, count_blocked
+from ginn_jax.reference import Scene, check_cast, count_blocked
 from ginn_jax.samples import Samples, sample_surface
 
 Rows = TypeVar("Rows")
@@ -89,7 +89,9 @@ def reached_by_light(
 ) -> Int[np.ndarray, "K"]:
     """The first `count` samples, or fewer where there are, from which at least one of
     `PROBE_RAYS` rays leaves the scene."""
-    found, size = np.zeros(0, np.int64), -(-count // PARTS)
+    ends = samples.position, samples.normal
+    check_cast(scene, *ends, FAR, PROBE_RAYS, seed)
+    found, size = np.zeros(0, np.int64), max(-(-count // PARTS), 1)
     for first in range(0, len(samples.position), size):
         rows = np.arange(first, min(first + size, len(samples.position)))
         found = np.append(found, rows[is_reached(scene, samples, rows, seed)])

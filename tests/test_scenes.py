@@ -165,7 +165,7 @@ def test_workers_make_the_same_and_keep_what_is_done(sources, made, tmp_path):
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from ginn_jax import objects, scenes, visible
+from ginn_jax import objects, scenes
 
 if __name__ == "__main__":
     sources = objects.procedural_sources(3, 5)
@@ -274,6 +274,16 @@ def test_few_rays_tell_what_all_would():
     for count in (len(wanted), 700):
         found = visible.reached_by_light(scene, samples, count, 5)
         np.testing.assert_array_equal(found, wanted[:count])
+
+
+def test_sampling_checks_what_ray_casting_does():
+    well = rooms.cup()
+    assert len(visible_samples(build_scene(well), 0, seed=1).position) == 0
+    with pytest.raises(InputError, match="seed"):
+        visible_samples(build_scene(well), 100, seed=2**40)
+    huge = build_scene(well._replace(vertices=well.vertices * np.float32(1e7)))
+    with pytest.raises(InputError, match="too short for coordinates"):
+        visible_samples(huge, 100, seed=1)
 
 
 def test_a_scene_that_is_sealed_is_refused(tmp_path):
