@@ -18,14 +18,8 @@ from benchmarks.timing import circumstances
 from ginn_jax import compare, report
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, require_positive, require_some, start
-from ginn_jax.compare_networks import (
-    Trained,
-    at_disk_radius,
-    errors_at_points,
-    load_trained,
-    network_picture,
-    points_given,
-)
+from ginn_jax.compare_networks import Trained, at_disk_radius, load_trained
+from ginn_jax.compare_pictures import errors_at_points, network_picture, points_given
 from ginn_jax.compare_tracing import trace
 from ginn_jax.evaluate import Row
 from ginn_jax.objects import Source

@@ -20,12 +20,13 @@ from ginn_jax.commandline import (
     command_line,
     require,
     require_positive,
+    require_shares,
     require_some,
     start,
 )
-from ginn_jax.compare_networks import Trained, load_trained, rows_at_points
+from ginn_jax.compare_networks import Trained, load_trained
+from ginn_jax.compare_pictures import rows_at_points
 from ginn_jax.dataset import count_asked, count_given
-from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import Cloud, LitCloud, take_points
 from ginn_jax.scenes import Occlusion, Settings, made_cloud
 
@@ -71,8 +72,7 @@ def main(options: Options) -> dict[str, Any]:
     least = {"objects": 1, "points": 1000, "reference": 2, "looks": 1}
     require(options, least)
     require_positive(options, "radius")
-    if not all(0.01 <= share <= 1 for share in options.shares):
-        raise InputError(f"--shares {options.shares} must be from 0.01 to 1")
+    require_shares(options, "shares")
     require_some(options, "shares")
     begin = time.perf_counter()
     counts = options.points, options.reference

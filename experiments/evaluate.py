@@ -21,30 +21,35 @@ from ginn_jax.commandline import (
     command_line,
     require,
     require_positive,
+    require_shares,
     require_some,
     start,
 )
-from ginn_jax.compare import Compared, Picture, Shot
+from ginn_jax.compare import Compared, Picture, Shot, Stage
 from ginn_jax.compare_light import counted_rows, sampling_seconds
 from ginn_jax.compare_networks import (
-    NETWORKS,
     OURS,
     Trained,
-    codes_kept,
     disk_variants,
-    errors_at_points,
     load_networks,
+    of_samples,
+    other_runs,
+)
+from ginn_jax.compare_pictures import (
+    codes_kept,
+    errors_at_points,
     mean_picture,
     network_memory,
-    network_picture,
-    other_runs,
+    network_pictures,
     points_given,
+    variant_rows,
 )
 from ginn_jax.compare_screen import screen_pictures
-from ginn_jax.compare_tracing import denoised_picture, traced_picture, with_reference
+from ginn_jax.compare_tracing import traced_rows, with_reference
 from ginn_jax.dataset import count_given
 from ginn_jax.evaluate import Row, at_scale
 from ginn_jax.experiment import make
+from ginn_jax.lit_clouds import Cloud
 from ginn_jax.objects import Source
 from ginn_jax.scenes import Settings, cloud_origin
 from ginn_jax.upsample import shading_step
@@ -87,6 +92,8 @@ class Options:
     """Poisson disk radii at which our network runs beside its own, as times that."""
     scales: tuple[float, ...] = (0.5, 0.333)
     """Shares of the resolution at which our network shades as well."""
+    shares: tuple[float, ...] = (0.5,)
+    """Shares of its samples that our network is given as well."""
     draws: int = 4
     """Draws of the Poisson disks over which our network's mean is taken beside it."""
     points: int | None = None
@@ -95,8 +102,8 @@ class Options:
     looks: int = 512
     """Directions of the direct light per sample and pixel: what all are given."""
     fewer_looks: tuple[int, ...] = (32, 128)
-    """So many directions instead, at which our network runs as well, what its light
-    takes counted in its time."""
+    """So many directions instead, at which our network runs as well, what samples and
+    light take counted in its time."""
     radius: float = 0.1
     """Occlusion radius."""
     seed: int = 0
@@ -116,6 +123,7 @@ def main(options: Options) -> dict[str, Any]:
     least |= {"points": 1000, "looks": 1, "draws": 2, "counts": 1, "fewer_looks": 1}
     require(options, least)
     require_positive(options, "disks")
+    require_shares(options, "shares")
     require_some(options, "counts")
     for scale in options.scales:
         shading_step(scale)
@@ -133,6 +141,7 @@ def main(options: Options) -> dict[str, Any]:
     settings = compare.with_looks(settings, options.looks)
     clouds = make(console, "clouds", sources, settings, options.out / "clouds")
     at_points, networks = errors_at_points(networks, clouds, sources, settings)
+    networks |= {OURS + of_samples(s): networks[OURS] for s in options.shares}
     networks |= disk_variants(networks[OURS], options.disks)
     networks |= other_runs(options.effect, settings, options.beside, key=key)
     found = []
@@ -140,11 +149,8 @@ def main(options: Options) -> dict[str, Any]:
         console.print(f"{source.name}")
         scene, networks = compare_scene(options, settings, source, cloud, networks)
         found.append(scene)
-    memory = {
-        name: network_memory(networks[name], count_given(settings.points))
-        for name in NETWORKS
-    }
-    at_points = {n: r | {"memory_mib": memory[n]} for n, r in at_points.items()}
+    for name, row in at_points.items():
+        row["memory_mib"] = network_memory(networks[name], count_given(settings.points))
     metrics = summary(options, at_points, found, [source.name for source in sources])
     shown = [(s.name, scene.shown) for s, scene in zip(sources, found, strict=True)]
     compare_figures.draw_methods(options.out / "ablation.png", shown[:4])
@@ -152,8 +158,7 @@ def main(options: Options) -> dict[str, Any]:
     compare_figures.draw_front(options.out / "error_against_time.png", *lines)
     text = compare_report.write_report(metrics)
     report.write_results(options.out, metrics, text)
-    lost = len(metrics["lost_cells"])
-    console.print(f"{lost} cells lost: {options.out / 'report.md'}")
+    console.print(f"{len(metrics['lost_cells'])} cells lost: {options.out}/report.md")
     return metrics
 
 
@@ -161,7 +166,7 @@ def compare_scene(
     options: Options,
     settings: Settings,
     source: Source,
-    cloud: Any,
+    cloud: Cloud,
     networks: dict[str, Trained],
 ) -> tuple[Compared, dict[str, Trained]]:
     """All methods on all views of a scene, and the networks with limits that do."""
@@ -181,53 +186,45 @@ def compare_scene(
             shot, settings, options.reference, path, origin, seed=source.seed
         )
         pictures = screen_pictures(shot, camera, settings, units)
-        for name in NETWORKS:
-            called = name, networks[name]
-            picture, networks[name] = network_picture(*called, given, shot)
-            pictures.append(picture)
+        more, networks = network_pictures(networks, given, shot)
+        pictures += more
         about = {"name": source.name, "view": view, "seconds_sampling": apart}
         about |= {"noise_dssim": compare.noise_dssim(shot, seed=view)}
         rows += [p.row | about for p in pictures]
         if view == 0:
             shown = compare.displayed(shot, pictures)
-            looks = sorted({options.looks, *options.fewer_looks})
-            ends = stage, given, shot, networks[OURS], looks, apart
-            counted, networks[OURS] = counted_rows(*ends, seed=source.seed)
-            front += [p.row for p in pictures]
-            own = next(p for p in pictures if p.row["method"] == OURS)
-            front += rivals(options, settings, shot, given, own, networks, units)
-            rates = {OURS + at_scale(scale) for scale in (1.0, *options.scales)}
-            front += [codes_kept(row) for row in front if row["method"] in rates]
+            ends = options, settings, stage, given, shot, pictures, networks, units
+            front, counted, networks = run_times(*ends, seed=source.seed)
     return Compared(rows, front, shown, counted), networks
 
 
-def rivals(
+def run_times(
     options: Options,
     settings: Settings,
+    stage: Stage,
+    given: Cloud,
     shot: Shot,
-    given: Any,
-    own: Picture,
+    pictures: list[Picture],
     networks: dict[str, Trained],
     units: np.ndarray | None,
-) -> list[Row]:
-    """Our network at other rates and radii, and tracing, plain and denoised."""
-    rows = []
-    for scale in options.scales:
-        called = OURS + at_scale(scale), networks[OURS]
-        picture, networks[OURS] = network_picture(*called, given, shot, scale)
-        rows.append(picture.row)
-    for name in [name for name in networks if name not in NETWORKS]:
-        picture, networks[name] = network_picture(name, networks[name], given, shot)
-        rows.append(picture.row)
-    ours = own, networks[OURS]
-    rows.append(mean_picture(*ours, given, shot, options.draws, units).row)
-    for count in options.counts:
-        seed = 1_000_003 + options.seed
-        noisy = traced_picture(shot, settings, count, units, seed=seed)
-        rows.append(noisy.row)
-        if denoised := denoised_picture(shot, noisy, units):
-            rows.append(denoised.row)
-    return rows
+    *,
+    seed: int,
+) -> tuple[list[Row], list[Row], dict[str, Trained]]:
+    """Error against run time of the pictures, of networks beside them and of tracing;
+    ours with all counted; and the networks with limits that do."""
+    own = next(p for p in pictures if p.row["method"] == OURS)
+    rates, shares = (1.0, *options.scales), sorted({1.0, *options.shares})
+    rows, networks = variant_rows(networks, given, shot, shares, rates, units)
+    rows = [p.row for p in pictures] + rows
+    kept = [row for row in rows if row["method"] in {OURS + at_scale(r) for r in rates}]
+    mean = mean_picture(own, networks[OURS], given, shot, options.draws, units)
+    rows += [mean.row, *map(codes_kept, kept)]
+    noise = 1_000_003 + options.seed
+    rows += traced_rows(shot, settings, options.counts, units, seed=noise)
+    sharing = {share: networks[OURS + of_samples(share)] for share in shares}
+    looks = sorted({options.looks, *options.fewer_looks})
+    ends = stage, given, shot, sharing, rates, looks, units
+    return rows, counted_rows(*ends, seed=seed), networks
 
 
 def summary(

@@ -75,8 +75,9 @@ Modules, in the order the data flows; each imports only what stands before it:
     evaluate_light    the same for effects that carry light
     pretrained        the trained networks that come with the package
     compare           shots, and the errors of the pictures that methods make of them
-    compare_networks  the networks on a shot: their pictures and memory
-    compare_light     our network with what its direct light takes
+    compare_networks  the networks: ours, its ablations and variants, other runs
+    compare_pictures  what they make of a shot: pictures, errors, memory
+    compare_light     our network with what its samples and direct light take
     compare_frames    the networks on the frames of an animation
     compare_screen    methods of screen space on a shot
     compare_tracing   references of shots, and tracing as a rival

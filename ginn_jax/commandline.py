@@ -154,6 +154,13 @@ def require_some(options: Any, *names: str, least: int = 1) -> None:
             raise InputError(f"--{flag} has {count} values: give at least {least}")
 
 
+def require_shares(options: Any, name: str) -> None:
+    """Raise `InputError` for the first share of an option beyond .01 or 1."""
+    for value in _values(options, name):
+        if not 0.01 <= value <= 1:
+            raise InputError(f"--{name} is {value}: give it from 0.01 to 1")
+
+
 def _values(options: Any, name: str) -> tuple[Any, ...]:
     """The values of an option: several, one, or none where it is left out."""
     value = getattr(options, name)

@@ -11,22 +11,29 @@ from matplotlib.patches import Rectangle
 
 from ginn_jax import report
 from ginn_jax.compare_networks import OTHER, OURS
+from ginn_jax.compare_report import pareto_front
 from ginn_jax.evaluate import Row
 from ginn_jax.metrics import foreground, tone_map
 
 
 def draw_front(path: Path, rows: list[Row], counted: Sequence[Row]) -> None:
-    """Error against run time, one line a kind of method."""
+    """Error against run time, one line a kind of method; of those with samples and
+    light `counted`, the ones that no other of them beats."""
     mine = [r for r in rows if r["method"].startswith(OURS)]
     fresh = [r for r in mine if "kept" not in r]
-    rates = [r for r in fresh if "scale" in r["method"]]
+    fewer = [r for r in fresh if "samples" in r["method"]]
+    rates = [r for r in fresh if "scale" in r["method"] and r not in fewer]
     means = [r for r in fresh if "mean" in r["method"]]
+    best = pareto_front(counted)
     groups = {
-        OURS: [r for r in fresh if r not in rates + means],
+        OURS: [r for r in fresh if r not in fewer + rates + means],
+        f"{OURS}, fewer samples": fewer,
         f"{OURS}, fewer pixels": rates,
         f"{OURS}, mean of draws": means,
         f"{OURS}, codes kept": [r for r in mine if "kept" in r],
-        f"{OURS}, light counted": list(counted),
+        f"{OURS}, samples and light counted": [
+            r for r in counted if r["method"] in best
+        ],
         "other runs": [r for r in rows if r["method"].startswith(OTHER)],
         "ablations": [r for r in rows if r["method"] in ("2D only", "3D only")],
         "screen space": [

@@ -154,25 +154,25 @@ are kept: {", ".join(m["front_kept"])}.
 
 
 def _of_light(m: Mapping[str, Any]) -> str:
-    """Our network with what its direct light takes, which is in no other time."""
-    if not m["light_counted"]:
-        return ""
+    """Our network with what its samples and light take, which is in no other time."""
     columns = {"method": "method", "seconds_sampling": "samples s"}
     columns |= {"seconds_samples": "their light s"}
     columns |= {"seconds_pixels": "of pixels s", "seconds_network": "network s"}
     columns |= {"seconds": "total s", "mse_2d": "2D MSE", "dssim_2d": "2D DSSIM"}
+    known = m["light_counted"][0]
+    columns = {k: head for k, head in columns.items() if k in known} | report.TRACING
     traced = [row for row in m["error_against_time"] if "traced" in row]
     rows = report.beside_tracing([*m["light_counted"], *traced], "traced")
     rows = rows[: len(m["light_counted"])]
     return f"""## With samples and direct light counted
 
-The networks are given samples and direct light, which are in none of the times above.
-Here they are, at fewer looks (directions of the light) a point as well, with the error
-that then is left. Light of pixels counts
-where the network asks for it; else it is the display alone that needs it, with tracing
-as well.
+The networks are given samples and, where there is light, direct light, which are in
+none of the times above. Here they are, with fewer samples, fewer looks (directions of
+the light) a point and fewer pixels as well, and the error that then is left. Light of
+pixels counts where the network asks for it; else it is the display alone that needs it,
+with tracing as well.
 
-{report.table_of(rows, columns | report.TRACING)}
+{report.table_of(rows, columns)}
 Pareto front of these and tracing, plain and denoised, by 2D MSE:
 {", ".join(m["front_counted"])}.
 """

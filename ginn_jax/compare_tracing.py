@@ -1,6 +1,7 @@
 """References of shots, and tracing as a rival: plain and denoised."""
 
 import importlib
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,19 @@ def with_reference(
         save_arrays(path, found, origin)
     kind = Estimate if isinstance(shot, View) else ColorEstimate
     return with_truth(shot, kind(**found))
+
+
+def traced_rows(
+    shot: Shot, settings: Settings, counts: Sequence[int], units: Any, *, seed: int
+) -> list[Row]:
+    """Tracing with each number of rays or paths a pixel, plain and denoised."""
+    rows = []
+    for count in counts:
+        noisy = traced_picture(shot, settings, count, units, seed=seed)
+        rows.append(noisy.row)
+        if denoised := denoised_picture(shot, noisy, units):
+            rows.append(denoised.row)
+    return rows
 
 
 def traced_picture(

@@ -64,6 +64,7 @@ def test_mistakes_in_options_end_in_code_2(
 SEVERAL = [
     (evaluate, ("--counts", "4", "0"), "--counts is 0: give at least 1"),
     (evaluate, ("--fewer-looks", "0"), "--fewer-looks is 0: give at least 1"),
+    (evaluate, ("--shares", ".5", "2"), "--shares is 2.0: give it from 0.01 to 1"),
     (evaluate, ("--disks", "1.5", "inf"), "--disks is inf: give it above 0"),
     (animation, ("--disks", "-1"), "--disks is -1.0: give it above 0"),
     (neighbors, ("--radii", ".1", "0"), "--radii is 0.0: give it above 0"),

@@ -176,10 +176,16 @@ def test_light_is_compared_with_tracing_plain_and_denoised(tmp_path, monkeypatch
     assert denoised["mse_2d"] == pytest.approx(plain["mse_2d"], rel=1e-5)
     assert denoised["seconds"] > plain["seconds"]
     assert asked[0] == (*[(40, 40, 3)] * 3, True, True)
-    counted = {row["looks"]: row for row in found["light_counted"]}
-    assert set(counted) == {16, 4}
-    assert counted[16]["mse_2d"] == pytest.approx(rows[OURS]["mse_2d"], rel=1e-3)
-    assert counted[4]["mse_2d"] != counted[16]["mse_2d"]
+    half = rows["ours, 0.5 of samples"]["mse_2d"]
+    assert half != rows[OURS]["mse_2d"]
+    assert "ours, 0.5 of samples, scale 1/2" in rows
+    counted = {row["method"]: row for row in found["light_counted"]}
+    assert len(counted) == 2 * 2 * 2
+    whole, fewer = (counted[f"ours, {n} looks"] for n in (16, 4))
+    assert whole["mse_2d"] == pytest.approx(rows[OURS]["mse_2d"], rel=1e-3)
+    assert fewer["mse_2d"] != whole["mse_2d"]
+    fewer = counted["ours, 0.5 of samples, 16 looks"]
+    assert fewer["mse_2d"] == pytest.approx(half, rel=1e-3)
     for row in counted.values():
         parts = "network", "sampling", "samples", "pixels"
         parts = [row[f"seconds_{part}"] for part in parts]
@@ -214,6 +220,7 @@ def test_comparison_ends_in_a_report_and_keeps_its_references(tmp_path):
         counts=(1, 4),
         disks=(),
         scales=(0.5,),
+        shares=(),
         points=2000,
     )
     first = experiment.main(options)
@@ -226,7 +233,10 @@ def test_comparison_ends_in_a_report_and_keeps_its_references(tmp_path):
     text = (tmp_path / "out" / "report.md").read_text()
     assert all(name in text for name in (*names, "rays of equal MSE"))
     errors = {row["method"]: row["mse_2d"] for row in first["results"]}
-    assert "direct light counted" not in text
+    counted, _ = first["light_counted"]
+    assert counted["mse_2d"] == front[OURS]["mse_2d"]
+    assert 0 < counted["seconds_sampling"] < counted["seconds"]
+    assert "| samples s | network s |" in text
     lost = [line for line in first["lost_cells"] if "mse_2d: screen space" in line]
     assert bool(lost) == (errors["screen space"] < errors[OURS])
     assert all(line in text for line in first["lost_cells"])
