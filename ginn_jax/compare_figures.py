@@ -50,6 +50,7 @@ def _short(row: Row) -> Row:
     """A row whose label leaves out what its line in the figure says."""
     name = row["method"].removesuffix(", denoised").removesuffix(", codes kept")
     name = name.removeprefix(f"{OURS}, ").removeprefix(OTHER)
+    name = name.replace(" of samples, scale", " at").replace(" of samples", "")
     return row | {"method": name}
 
 

@@ -214,13 +214,14 @@ def draw_error_against_time(
     path: Path, groups: Mapping[str, Sequence[Mapping[str, Any]]]
 ) -> None:
     """2D error against time, log-log: one line a group, one labelled dot a method."""
-    figure = Figure(figsize=(6.5, 4.5), layout="constrained")
+    figure = Figure(figsize=(8, 5.5), layout="constrained")
     axes, dots = figure.add_subplot(), list[tuple[str, float, float]]()
-    for name, rows in groups.items():
+    marks = [mark for mark in "os^" for _ in range(10)]  # there are ten colours
+    for mark, (name, rows) in zip(marks, groups.items(), strict=False):
         ordered = sorted(rows, key=lambda row: row["seconds"])
         seconds = [1e3 * row["seconds"] for row in ordered]
         errors = [max(row["mse_2d"], 1e-7) for row in ordered]
-        axes.plot(seconds, errors, "o-", label=name)
+        axes.plot(seconds, errors, f"{mark}-", label=name)
         names = [row["method"] for row in ordered]
         dots += zip(names, seconds, errors, strict=True)
     axes.set(xlabel="ms per image", ylabel="2D MSE", xscale="log", yscale="log")
@@ -230,7 +231,7 @@ def draw_error_against_time(
         minor_formatter=NullFormatter(),
     )
     axes.grid(alpha=0.3)
-    figure.legend(loc="outside upper center", ncols=3, fontsize=8)
+    figure.legend(loc="outside upper center", ncols=4, fontsize=8)
     label_dots(axes, dots)
     figure.savefig(path, dpi=140)
 
