@@ -2,6 +2,7 @@
 
 import ctypes
 import gc
+import logging
 import multiprocessing
 import os
 import threading
@@ -9,6 +10,8 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import jax
+
+LOG = logging.getLogger("ginn_jax")
 
 # Compiler options of what runs on several devices at once: with a device on every core
 # none has another to share a kernel with.
@@ -61,6 +64,12 @@ def spare_memory_maps() -> None:
     except OSError:
         return
     if taken > SHARE_OF_MAPS * most:
+        LOG.warning(
+            "compiled programs hold %d of a process's %d memory maps and are let go: "
+            "`sysctl -w vm.max_map_count=1000000` spares compiling them again",
+            taken,
+            most,
+        )
         forget_programs()
 
 

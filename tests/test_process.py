@@ -24,8 +24,11 @@ def programs_left(share, work, monkeypatch):
 
 @linux
 @pytest.mark.parametrize(("share", "left"), [(0.0, 0), (1.0, 2)])
-def test_programs_are_let_go_where_memory_maps_run_out(share, left, monkeypatch):
+def test_programs_are_let_go_where_memory_maps_run_out(
+    share, left, monkeypatch, caplog
+):
     assert programs_left(share, process.spare_memory_maps, monkeypatch) == left
+    assert ("vm.max_map_count" in caplog.text) == (left == 0)
 
 
 @linux
