@@ -4,6 +4,7 @@ from functools import cache, partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.stability_cases import Case, plain, small_network
@@ -54,7 +55,7 @@ def whole(
     built, demands = geometry.build_geometry(
         network, limits, cloud, key=jax.random.key(KEY)
     )
-    order = np.arange(cloud.mask.shape[0])
+    order = jnp.arange(cloud.mask.shape[0], dtype=jnp.int32)
     code, scale = shading.encode_channels(
         network, variables, built, order, cloud.mask, material, light
     )

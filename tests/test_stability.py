@@ -10,14 +10,20 @@ import pytest
 import tiny
 import trimesh
 
-from benchmarks import stability, stability_cases, stability_stages
-from ginn_jax import dataset, hierarchy, image, inference, irradiance, train
+from benchmarks import (
+    stability,
+    stability_cases,
+    stability_network,
+    stability_stages,
+)
+from ginn_jax import dataset, hierarchy, image, inference, irradiance, recipe, train
 from ginn_jax.dataset import unit_light
 from ginn_jax.errors import InputError, InputWarning
 from ginn_jax.lighting import PointLight
 from ginn_jax.limits import Limits, raise_limits
 from ginn_jax.mesh import Mesh
 from ginn_jax.shading import Encoded
+from ginn_jax.train import state_shapes
 
 KEY = jax.random.key(0)
 CLOUD = tiny.sphere_on_plane(300, 0)
@@ -219,6 +225,20 @@ def test_benchmark_sees_a_lost_pair_and_a_lost_point(monkeypatch):
         hierarchy, "poisson_disk", lambda *a, key: thin(*a, key=key)[1:]
     )
     assert all(stage(case)["error"] > 0 for stage in stages)
+
+
+def test_benchmark_knows_the_network():
+    """What it traces for every case; running that takes minutes."""
+    case, network = stability_cases.plain(), stability_cases.small_network()
+    config = recipe.Training(network, 1, batch_size=1, points=256, queries=64)
+    cloud = stability_stages.oriented(case)
+    numbers = case.albedo.astype(np.float32), case.light.astype(np.float32)
+    given = state_shapes(config).variables, cloud, *numbers, cloud
+    fixed = network, stability_network.roomy(network)
+    traced = partial(stability_network.whole, *fixed)
+    _, values, demands = jax.eval_shape(traced, *given)
+    assert values.shape == (len(case.light), len(case.position))
+    assert set(demands) == set(dict(fixed[1].sizes))
 
 
 def test_report_says_what_is_outside_and_what_was_refused():
