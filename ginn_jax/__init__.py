@@ -31,6 +31,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     voxels            points sorted by voxel, found by binary search under jit
     candidates        points that packets of queries may be near
     packets           radius search by packets of queries under jit
+    pairs             what a search on the host found: decided, joined, in order
     neighbors         radius search on the host: exact, sizes itself
     hierarchy         Poisson disk sampling
     receptive_field   what an edge shows a kernel, what its sender weighs

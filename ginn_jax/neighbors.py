@@ -3,8 +3,7 @@
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from itertools import accumulate
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,23 +20,16 @@ from ginn_jax.candidates import (
 from ginn_jax.checks import real_array
 from ginn_jax.errors import InputError
 from ginn_jax.packets import Words, list_bits, packet_words
+from ginn_jax.pairs import Pairs, decide, in_order, join
 from ginn_jax.process import ALONE, available_cores
 from ginn_jax.voxels import VoxelGrid, build_grid, morton_code
 
 QUERY_BLOCK = 1 << 17
 WORD_BLOCK = 1 << 16
-# So rarely is a pair to be left out that copying what lies between them is faster.
-FEW = 1000
+# So many points lie so close that queries of a block, in no order, are far apart.
+MANY = 1 << 17
 # Squares of lengths from 1 / FAR to FAR are normal numbers in float32.
 FAR = 1e18
-
-
-class Pairs(NamedTuple):
-    """Pairs of some queries, sorted by query; which of them float32 cannot decide."""
-
-    query: Int[np.ndarray, "E"]
-    point: Int[np.ndarray, "E"]
-    doubtful: Bool[np.ndarray, "E"]
 
 
 def find_neighbors(
@@ -48,8 +40,8 @@ def find_neighbors(
     """Host-level search: (query_index, point_index) of all pairs closer than `radius`.
 
     Sorted by query. Sizes itself: every stage gets the capacity that the one before it
-    counted, and queries are taken in blocks. Pairs within rounding of the radius are
-    decided in float64.
+    counted, and queries are taken in blocks, near ones together where points are many.
+    Pairs within rounding of the radius are decided in float64.
 
     Raises:
         InputError: a shape other than [n, 3], a non-finite number, a radius <= 0; or
@@ -62,6 +54,21 @@ def find_neighbors(
         as_points("queries", queries)  # refused all the same
         return np.zeros(0, np.int32), np.zeros(0, np.int32)
     center = 0.5 * (points.min(0) + points.max(0))
+    if len(points) > MANY:
+        near = np.asarray(as_points("queries", queries) - center, np.float32)
+        order = _along_curve(*pad_rows(near, bucket(len(near))))[: len(near)]
+        pairs = _search(points, queries.take(order, axis=0), radius, center)
+        return in_order(*pairs, order)
+    return _search(points, queries, radius, center)
+
+
+def _search(
+    points: Float[np.ndarray, "N 3"],
+    queries: Shaped[np.ndarray, "M 3"],
+    radius: float,
+    center: Float[np.ndarray, "3"],
+) -> tuple[Int[np.ndarray, "E"], Int[np.ndarray, "E"]]:
+    """`find_neighbors` block by block, coordinates counted from `center`."""
     near_points = np.asarray(points - center, np.float32)
     padded, mask = pad_rows(near_points, bucket(len(points)))
     grid = _build_grid(padded, mask, np.float32(radius))
@@ -77,11 +84,11 @@ def find_neighbors(
         near = np.empty(block.shape, np.float32)
         np.subtract(block, middle[: len(block)], out=near, casting="same_kind")
         found = _search_block(grid, near, shell, first)
-        return [_decide(pairs, points, queries, radius) for pairs in found]
+        return [decide(pairs, points, queries, radius) for pairs in found]
 
     with ThreadPoolExecutor(available_cores()) as pool:
         blocks = pool.map(search, range(0, len(queries), QUERY_BLOCK))
-        return _join([part for block in blocks for part in block], pool)
+        return join([part for block in blocks for part in block], pool)
 
 
 def as_rows(name: str, points: Any) -> Shaped[np.ndarray, "N 3"]:
@@ -158,47 +165,6 @@ def _along_curve(
     code |= np.arange(len(query), dtype=np.uint64)
     code.sort()
     return code.astype(np.uint32).astype(np.int32)
-
-
-def _decide(
-    pairs: Pairs,
-    points: Float[np.ndarray, "N 3"],
-    queries: Float[np.ndarray, "M 3"],
-    radius: float,
-) -> tuple[Pairs, Int[np.ndarray, "K"]]:
-    """The pairs and which of them float64 finds to be as far apart as the radius.
-
-    Where those are many they are left out here, not by `_join`.
-    """
-    doubtful = np.flatnonzero(pairs.doubtful)
-    offset = points[pairs.point[doubtful]] - queries[pairs.query[doubtful]]
-    wrong = doubtful[np.sum(offset**2, axis=-1) >= radius**2]
-    if len(wrong) * FEW <= len(pairs.query):
-        return pairs, wrong
-    return Pairs(*(np.delete(column, wrong) for column in pairs)), wrong[:0]
-
-
-def _join(
-    parts: list[tuple[Pairs, Int[np.ndarray, "K"]]], pool: ThreadPoolExecutor
-) -> tuple[Int[np.ndarray, "E"], Int[np.ndarray, "E"]]:
-    """Query and point of all pairs but the wrong ones of every part.
-
-    Copied once and on all cores: fresh memory is slow.
-    """
-    sizes = (len(pairs.query) - len(wrong) for pairs, wrong in parts)
-    *places, total = accumulate(sizes, initial=0)
-    query, point = (np.empty(total, np.int32) for _ in range(2))
-
-    def put(part: tuple[Pairs, Int[np.ndarray, "K"]], place: int) -> None:
-        pairs, wrong = part
-        ends = [*wrong.tolist(), len(pairs.query)]
-        for start, end in zip([0, *(wrong + 1).tolist()], ends, strict=True):
-            run = slice(place, place + end - start)
-            query[run], point[run] = pairs.query[start:end], pairs.point[start:end]
-            place += end - start
-
-    list(pool.map(put, parts, places))
-    return query, point
 
 
 @partial(jax.jit, static_argnames="capacity", compiler_options=ALONE)

@@ -24,6 +24,7 @@ from strategies import (
 
 from ginn_jax import neighbors as nb
 from ginn_jax import packets as pk
+from ginn_jax import pairs as found_pairs
 from ginn_jax import voxels as vx
 from ginn_jax.candidates import PACKET
 from ginn_jax.errors import InputError
@@ -73,10 +74,27 @@ def sandwich(points, queries, radius):
     ]
 
 
-@given(clouds(), clouds(), RADII)
-def test_host_search_equals_brute_force(points, queries, radius):
+@given(clouds(), clouds(), RADII, st.sampled_from([0, nb.MANY]))
+def test_host_search_equals_brute_force(points, queries, radius, many):
     points, queries = points.astype(np.float64), queries.astype(np.float64)
-    assert found(points, queries, radius) == neighbors(points, queries, radius)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(nb, "MANY", many)  # queries in order of a curve, or as they are
+        assert found(points, queries, radius) == neighbors(points, queries, radius)
+
+
+def test_queries_in_no_order_are_not_searched_one_by_one(monkeypatch):
+    """A packet of queries far apart has more to list than one of neighbours."""
+    normal = np.random.default_rng(3).normal(size=(6000, 3))
+    cloud = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    monkeypatch.setattr(nb, "QUERY_BLOCK", 1000)
+    monkeypatch.setattr(nb, "WORD_BLOCK", 300)
+    monkeypatch.setattr(nb, "MANY", 5000)
+    search, calls = nb._search_block, []
+    monkeypatch.setattr(
+        nb, "_search_block", lambda *args: calls.append(0) or search(*args)
+    )
+    nb.find_neighbors(cloud, cloud, 0.02)
+    assert len(calls) == 6
 
 
 @given(
@@ -89,7 +107,7 @@ def test_host_search_is_exact_at_the_radius(cloud, radius, shift, few):
     """Distances that differ from the radius by one rounding of float64, or by none."""
     cloud = cloud + shift
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(nb, "FEW", few)  # left out one by one, or all at once
+        patch.setattr(found_pairs, "FEW", few)  # left out one by one, or all at once
         assert found(cloud, cloud, radius) == neighbors(cloud, cloud, radius)
 
 
