@@ -74,7 +74,7 @@ def write_report(rows: list[Row]) -> str:
     for stage in stages:
         mine = [r for r in measured if r["stage"] == stage]
         good = [r for r in mine if r["error"] < GOOD and not r["bad"]]
-        largest = max((r["error"] for r in good), default=float("nan"))
+        largest: Any = max((r["error"] for r in good), default="-")
         summary.append([stage, len(mine), len(good), largest])
     outside = [
         r

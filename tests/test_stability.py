@@ -246,9 +246,11 @@ def test_report_says_what_is_outside_and_what_was_refused():
         {"stage": "f_2D", "case": "good", "error": 1e-6, "bad": 0, "ms": 1.0},
         {"stage": "f_2D", "case": "poor", "error": 0.5, "bad": 3, "ms": 1.0},
         {"stage": "f_2D", "case": "bent", "note": "refused: no"},
+        {"stage": "subsurface", "case": "noisy", "error": 0.1, "bad": 0, "ms": 1.0},
     ]
     parts = stability.write_report(rows).split("\n\n")
     tables = [part for part in parts if part.startswith("| ")]
     assert "| f_2D | 2 | 1 | 1e-06 |" in tables[0]
+    assert "| subsurface | 1 | 0 | - |" in tables[0]
     assert [case in tables[1] for case in ("good", "poor", "bent")] == [0, 1, 0]
     assert [case in tables[2] for case in ("good", "poor", "bent")] == [0, 0, 1]
