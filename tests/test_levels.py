@@ -16,6 +16,7 @@ from strategies import ALL_PAIRS, POINTS, SEEDS, padded
 
 from ginn_jax import hierarchy, inference, levels
 from ginn_jax.packets import radius_edges
+from ginn_jax.train import state_shapes
 from ginn_jax.voxels import build_grid
 
 pytestmark = pytest.mark.usefixtures("cheap_compiling")
@@ -143,7 +144,11 @@ def test_every_level_keeps_what_it_kept_however_points_are_sorted(built):
 
 def test_an_encoding_takes_what_the_one_before_kept():
     points = tiny.sphere_on_plane(1000, 4)
-    variables = tiny.fresh_state().variables
+    rng = np.random.default_rng(0)
+    variables = jax.tree.map(
+        lambda leaf: rng.normal(size=leaf.shape).astype(leaf.dtype),
+        state_shapes(tiny.CONFIG).variables,
+    )
     given = variables, points.position, points.normal
     one, two = jax.random.split(jax.random.key(0))
 
