@@ -56,7 +56,7 @@ class Compared(NamedTuple):
     rows     the table, a row for each method and view
     front    error against run time, in the first view
     shown    the first view's pictures
-    counted  ours by looks, its direct light counted in its time
+    counted  ours by samples, looks and pixels, samples and light counted in its time
     """
 
     rows: list[Row]
