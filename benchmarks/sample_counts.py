@@ -27,7 +27,7 @@ from ginn_jax.commandline import (
 from ginn_jax.compare_networks import Trained, load_trained
 from ginn_jax.compare_pictures import rows_at_points
 from ginn_jax.dataset import count_asked, count_given
-from ginn_jax.lit_clouds import Cloud, LitCloud, take_points
+from ginn_jax.lit_clouds import Cloud, points_of
 from ginn_jax.scenes import Occlusion, Settings, made_cloud
 
 
@@ -109,10 +109,7 @@ def with_points(settings: Settings, count: int) -> Settings:
 
 def thinned(cloud: Cloud, share: float) -> Cloud:
     """A share of the samples that a network is given, and of those it is asked at."""
-    rows = rows_of(len(cloud.position), share)
-    if isinstance(cloud, LitCloud):
-        return take_points(cloud, rows)
-    return jax.tree.map(lambda a: a[rows], cloud)
+    return points_of(cloud, rows_of(len(cloud.position), share))
 
 
 def rows_of(count: int, share: float) -> Int[np.ndarray, "_"]:

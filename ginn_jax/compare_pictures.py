@@ -23,7 +23,7 @@ from ginn_jax.dataset import count_given
 from ginn_jax.evaluate import Row, View, at_scale
 from ginn_jax.inference import encode_whole, shade_turn
 from ginn_jax.limits import only, without
-from ginn_jax.lit_clouds import Cloud, LitCloud, mean_light, split_points, take_points
+from ginn_jax.lit_clouds import Cloud, LitCloud, mean_light, points_of, split_points
 from ginn_jax.neighbors import bucket
 from ginn_jax.objects import Source
 from ginn_jax.process import spare_memory_maps
@@ -42,9 +42,7 @@ def points_given(cloud: Any) -> tuple[Any, np.ndarray | None]:
 def first_samples(cloud: Cloud, share: float) -> Cloud:
     """A share of a cloud, whose samples are in no order: the first, at least one."""
     count = max(int(share * len(cloud.position)), 1)
-    if isinstance(cloud, LitCloud):
-        return take_points(cloud, slice(count))
-    return jax.tree.map(lambda a: a[:count], cloud)
+    return points_of(cloud, slice(count))
 
 
 def errors_at_points(

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -104,6 +105,13 @@ def take_points(cloud: LitCloud, rows: Any) -> LitCloud:
     whole = {"albedo": cloud.albedo, "medium": cloud.medium}
     points = {n: a[rows] for n, a in cloud._asdict().items() if n not in whole}
     return LitCloud(**points, **whole)
+
+
+def points_of(cloud: Cloud, rows: Any) -> Cloud:
+    """Some points of a cloud of either kind."""
+    if isinstance(cloud, LitCloud):
+        return take_points(cloud, rows)
+    return jax.tree.map(lambda a: a[rows], cloud)
 
 
 def save_lit_cloud(path: Path, cloud: LitCloud, origin: dict[str, Any]) -> None:
