@@ -26,6 +26,7 @@ from ginn_jax.experiment import (
     closing,
     errors_by_set,
     make,
+    on_disk,
     train,
     training,
 )
@@ -76,6 +77,7 @@ def main(options: Options) -> dict[str, Any]:
     """Run the experiment; returns what metrics.json holds."""
     check_run(options, {"rays": 2, "test_points": 1000})
     require_positive(options, "radius")
+    network = on_disk(options, presets.PRESETS[options.preset])
     console = Console()
     clock = Clock()
     settings = scenes.Occlusion(options.points, options.rays, options.radius)
@@ -91,7 +93,6 @@ def main(options: Options) -> dict[str, Any]:
     unseen = make(console, "unseen clouds", test_sources, exact, folder / "unseen")
     clock.lap("data", begin)
 
-    network = presets.PRESETS[options.preset]
     config = training(options, network, options.points, len(clouds))
     extra = {"data": asdict(settings), "objects": [s.name for s in train_sources]}
     run = train(console, config, clouds, options, extra)

@@ -20,6 +20,7 @@ from ginn_jax.architecture import Network
 from ginn_jax.checks import positive
 from ginn_jax.commandline import require, require_positive
 from ginn_jax.dataset import count_asked, count_given
+from ginn_jax.disk_radius import with_disk_radius
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Row, pool_rows
 from ginn_jax.lit_clouds import Cloud
@@ -48,6 +49,8 @@ class RunOptions:
     """Samples per object."""
     sparsest: float = 1.0
     """Each step gives the network a share of its samples between this and all."""
+    disk: float = 1.0
+    """Poisson disk radius of the finest level, as times the preset's."""
     schedule: Literal["cosine", "paper"] = "cosine"
     """Muon with warm-up and cosine decay, or the paper's Adam, x0.7 every 10 epochs."""
     steps: int = 3000
@@ -75,7 +78,7 @@ def check_run(options: RunOptions, least: dict[str, int]) -> None:
     bounds = {"shapes": 0, "test_shapes": 1, "points": 1000, "steps": 1, "batch": 1}
     require(options, bounds | {"resolution": 32, "seed": 0} | least)
     shading_step(options.resolution_scale)
-    require_positive(options, "learning_rate")
+    require_positive(options, "learning_rate", "disk")
     positive("--sparsest", options.sparsest, 1.0)
     if options.start is not None:
         load_any(options.start)  # a name that is wrong is said before data are made
@@ -84,6 +87,14 @@ def check_run(options: RunOptions, least: dict[str, int]) -> None:
             f"--seed {options.seed} with {options.shapes} shapes would train on those "
             f"held back: give a seed below {UNSEEN_SEED // SEEDS_APART}"
         )
+
+
+def on_disk(options: RunOptions, network: Network) -> Network:
+    """The network on the finest Poisson disk that the options ask for.
+
+    Raises `InputError` for one that the network cannot do with.
+    """
+    return with_disk_radius(network, options.disk * network.levels[0])
 
 
 @dataclass

@@ -19,6 +19,7 @@ from ginn_jax.experiment import (
     closing,
     errors_by_set,
     make,
+    on_disk,
     train,
     training,
 )
@@ -44,6 +45,7 @@ def run_experiment(
 ) -> dict[str, Any]:
     """Data, training, evaluation and report of one effect; what metrics.json holds."""
     check_run(options, {"paths": 2, "lights": 1})
+    network = on_disk(options, network)
     console, clock, begin = Console(), Clock(), time.perf_counter()
     seen, unseen = choose_sources(options)
     if options.split == "paper":

@@ -44,6 +44,8 @@ def ends(monkeypatch, capsys, script, *words, main=None):
         (("--seed", "-1"), "--seed is -1"),
         (("--seed", "100"), "--seed 100"),
         (("--learning-rate", "nan"), "--learning-rate is nan: give it above 0"),
+        (("--disk", "0"), "--disk is 0.0: give it above 0"),
+        (("--disk", "3"), r"Poisson radius 0\.0.: must lie between 0 and the f_2D"),
         (("--resolution-scale", "0"), r"resolution scale 0\.0: give 1 over"),
         (("--preset", "none"), "--preset"),
         (("--no-such-option",), "no-such-option"),

@@ -37,6 +37,7 @@ SMALL = ao_train.Options(
     test_points=1000,
     steps=2,
     resolution=32,
+    disk=0.9,
     quick=True,
 )
 
@@ -95,6 +96,8 @@ def test_a_small_run_leaves_all_that_is_promised(tmp_path, monkeypatch):
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert not [key for key in KEYS if key not in metrics]
     assert metrics["steps"] == 2
+    network = metrics["training"]["network"]
+    assert network["levels"] == pytest.approx([0.9 * tiny.ONE_LEVEL.levels[0]])
     assert len(metrics["unseen shapes, each"]) == 2
     rays = [r["mse_2d"] for r in metrics["error_against_time"] if "rays" in r]
     assert rays == sorted(rays, reverse=True)
