@@ -140,13 +140,13 @@ def _inputs_in_tiles(
 
 
 def _inputs_forward(
-    oriented: bool, *arrays: Array
-) -> tuple[Float[Array, "D E"], tuple[Array, ...]]:
+    oriented: bool, *arrays: Any
+) -> tuple[Float[Array, "D E"], tuple[Any, ...]]:
     return _inputs_in_tiles(oriented, *arrays), arrays
 
 
 def _inputs_backward(
-    oriented: bool, arrays: tuple[Array, ...], cotangent: Float[Array, "D E"]
+    oriented: bool, arrays: tuple[Any, ...], cotangent: Float[Array, "D E"]
 ) -> tuple[Array | None, ...]:
     """Cotangents of both ends and the radius, all edges at once."""
     *ends, receiver, sender, count = arrays
