@@ -34,6 +34,7 @@ from ginn_jax.compare_networks import (
     load_networks,
     of_samples,
     other_runs,
+    warn_of_seen,
 )
 from ginn_jax.compare_pictures import (
     codes_kept,
@@ -113,8 +114,8 @@ class Options:
 
 
 QUICK = {"objects": 1, "views": 1, "resolution": 64, "reference": 16, "points": 4000}
-QUICK |= {"counts": (1, 4), "disks": (), "scales": (0.5,), "draws": 2}
-QUICK |= {"fewer_looks": (32,)}
+QUICK |= {"counts": (1, 4), "disks": (), "scales": (0.5,), "fewer_looks": (32,)}
+QUICK |= {"draws": 2}
 
 
 def main(options: Options) -> dict[str, Any]:
@@ -131,11 +132,11 @@ def main(options: Options) -> dict[str, Any]:
     targets = 64 if options.quick else TARGET_PATHS
     given = options.effect, options.points, targets, options.radius
     settings = compare.effect_settings(*given)
-    where = options.meshes, options.envmaps
-    sources = compare.unseen_sources(
-        options.effect, options.objects, *where, seed=options.seed
-    )
+    given = options.effect, options.objects, options.meshes, options.envmaps
+    sources = compare.unseen_sources(*given, seed=options.seed)
+    names = [source.name for source in sources]
     runs = options.checkpoint, options.only_2d, options.only_3d
+    warn_of_seen((*runs, *options.beside), names)
     key = jax.random.key(options.seed)
     networks = load_networks(options.effect, settings, runs, key=key)
     settings = compare.with_looks(settings, options.looks)
@@ -151,13 +152,12 @@ def main(options: Options) -> dict[str, Any]:
         found.append(scene)
     for name, row in at_points.items():
         row["memory_mib"] = network_memory(networks[name], count_given(settings.points))
-    metrics = summary(options, at_points, found, [source.name for source in sources])
-    shown = [(s.name, scene.shown) for s, scene in zip(sources, found, strict=True)]
+    metrics = summary(options, at_points, found, names)
+    shown = [(n, scene.shown) for n, scene in zip(names, found, strict=True)]
     compare_figures.draw_methods(options.out / "ablation.png", shown[:4])
     lines = metrics["error_against_time"], metrics["light_counted"]
     compare_figures.draw_front(options.out / "error_against_time.png", *lines)
-    text = compare_report.write_report(metrics)
-    report.write_results(options.out, metrics, text)
+    report.write_results(options.out, metrics, compare_report.write_report(metrics))
     console.print(f"{len(metrics['lost_cells'])} cells lost: {options.out}/report.md")
     return metrics
 

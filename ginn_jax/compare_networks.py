@@ -1,5 +1,6 @@
 """The networks of a comparison: ours, its ablations and variants, other runs."""
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ from ginn_jax.limits import Limits
 from ginn_jax.pretrained import load_manifest, load_network
 from ginn_jax.run_record import RECORD, damaged, read_record
 from ginn_jax.scenes import Occlusion, Settings
+
+LOG = logging.getLogger("ginn_jax")
 
 Trained = tuple[Network, Limits, Model]
 
@@ -84,6 +87,24 @@ def learned_from(name: str, run: Path | None) -> dict[str, Any]:
     path = run / RECORD
     with damaged(path, "train again"):
         return dict(read_record(path, "no run: name the --out of one")["data"])
+
+
+def warn_of_seen(runs: Sequence[Path | None], scenes: Sequence[str]) -> None:
+    """Say of each run which of these scenes have an object or a light by whose name it
+    trained on one."""
+    for run in filter(None, runs):
+        with damaged(run / RECORD, "train again"):
+            record = read_record(run / RECORD, "no run: name the --out of one")
+            names = record.get("objects", [])
+            seen = {part for name in names for part in name.split("__")}
+        found = sorted({part for name in scenes for part in name.split("__")} & seen)
+        if found:
+            LOG.warning(
+                "%s trained on what is called %s: its errors may be of scenes it has "
+                "seen",
+                run,
+                ", ".join(found),
+            )
 
 
 def check_radius(name: str, data: dict[str, Any], radius: float) -> None:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from experiments import evaluate as experiment
 from ginn_jax import blocks, checkpoint, report, run_record, scenes
 from ginn_jax.compare_figures import inset_place
-from ginn_jax.compare_networks import OURS, other_runs, redrawn
+from ginn_jax.compare_networks import OURS, other_runs, redrawn, warn_of_seen
 from ginn_jax.compare_report import (
     RIVALS,
     lost_cells,
@@ -99,7 +99,7 @@ def test_inset_lies_where_the_reference_varies():
 pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
 
-LEARNED = {"data": {"radius": 0.1}}
+LEARNED = {"data": {"radius": 0.1}, "objects": ["cat", "duck__noon"]}
 
 
 def finished_run(folder, network=tiny.ONE_LEVEL):
@@ -132,6 +132,18 @@ def test_runs_beside_need_names_of_their_own(tmp_path):
     settings = scenes.Occlusion(2000, 8, radius=0.1)
     with pytest.raises(InputError, match="one name"):
         other_runs("ao", settings, runs, key=jax.random.key(0))
+
+
+@pytest.mark.parametrize(
+    ("scene", "seen"),
+    [("cat", "cat"), ("cat__noon", "cat, noon"), ("dog__noon", "noon"), ("dog", "")],
+)
+def test_scenes_that_a_run_trained_on_are_named(scene, seen, tmp_path, caplog):
+    run_record.save_run(tmp_path, tiny.CONFIG, tiny.ROOM, LEARNED)
+    warn_of_seen((None, tmp_path), ["cow__dusk", scene])
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == bool(seen)
+    assert not seen or f"called {seen}: " in said[0]
 
 
 @pytest.mark.usefixtures("small_blocks")
