@@ -23,7 +23,7 @@ from ginn_jax.facets import facet_means, smooth_queries
 from ginn_jax.geometry import Geometry, build_geometry, build_query_field
 from ginn_jax.limits import Demands, Limits
 from ginn_jax.ranges import compact
-from ginn_jax.receptive_field import Field, Oriented
+from ginn_jax.receptive_field import Field, Oriented, input_count
 from ginn_jax.voxels import build_grid, morton_order
 
 
@@ -95,7 +95,7 @@ def blank_example(network: Network) -> Example:
     """
     place, row = jnp.zeros((1, 3)), jnp.zeros(1, jnp.int32)
     point = Oriented(place, place, jnp.ones(1, bool))
-    inputs = jnp.zeros((7 if network.oriented else 3, 1))
+    inputs = jnp.zeros((input_count(network.oriented), 1))
     field = Field(row, row, inputs, jnp.zeros(1), jnp.int32(1))
     fields = {conv.name: field for conv in network.encoder}
     grid = build_grid(place, point.mask, jnp.float32(1))

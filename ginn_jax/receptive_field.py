@@ -71,6 +71,11 @@ def tile_count(edges: int, count: Int[Array, ""]) -> Int[Array, ""]:
     return tiles_holding(jnp.minimum(count, edges), tile_size(edges))
 
 
+def input_count(oriented: bool) -> int:
+    """How many numbers `kernel_inputs` has of an edge."""
+    return 7 if oriented else 3
+
+
 def kernel_inputs(
     senders: Oriented,
     receivers: Oriented,
@@ -135,7 +140,7 @@ def _inputs_in_tiles(
         some = jnp.stack(rows)
         return jax.lax.dynamic_update_slice_in_dim(inputs, some, start, axis=1)
 
-    nothing = jnp.zeros((7 if oriented else 3, edges), senders.dtype)
+    nothing = jnp.zeros((input_count(oriented), edges), senders.dtype)
     return jax.lax.fori_loop(0, tile_count(edges, count), fill, nothing)
 
 
