@@ -27,7 +27,13 @@ from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import command_line, require, require_positive, start
 from ginn_jax.compare import Stage
 from ginn_jax.compare_frames import Playing, shade_next, start_playing
-from ginn_jax.compare_networks import OURS, Trained, disk_variants, load_networks
+from ginn_jax.compare_networks import (
+    OURS,
+    Trained,
+    disk_variants,
+    load_networks,
+    others_beside,
+)
 from ginn_jax.compare_screen import screen_pictures
 from ginn_jax.compare_tracing import trace
 from ginn_jax.dataset import ShadedPoints
@@ -55,6 +61,8 @@ class Options:
     """The same of the 2D-only network."""
     only_3d: Path | None = None
     """The same of the 3D-only network."""
+    beside: tuple[str, ...] = ()
+    """The --out of runs of other networks of the effect, or names as "ao_fine"."""
     animation: Path | None = None
     """An .npz of vertices [T V 3] and faces [F 3], or a folder of them; left out, a
     procedural one."""
@@ -97,11 +105,11 @@ def main(options: Options) -> dict[str, Any]:
     counts = options.points, options.reference
     settings = compare.effect_settings(options.effect, *counts, options.radius)
     scenes = choose_sequences(options, ground=options.effect != "sss")
-    light = choose_light(options)
-    key = jax.random.key(options.seed)
+    light, key = choose_light(options), jax.random.key(options.seed)
     runs = options.checkpoint, options.only_2d, options.only_3d
     networks = load_networks(options.effect, settings, runs, key=key)
     networks |= disk_variants(networks[OURS], options.disks)
+    networks |= others_beside(options.effect, settings, options.beside, key=key)
     found = {}
     with bar(console) as progress:
         total = sum(map(len, scenes.values()))

@@ -33,7 +33,7 @@ from ginn_jax.compare_networks import (
     disk_variants,
     load_networks,
     of_samples,
-    other_runs,
+    others_beside,
     warn_of_seen,
 )
 from ginn_jax.compare_pictures import (
@@ -52,6 +52,7 @@ from ginn_jax.evaluate import Row, at_scale
 from ginn_jax.experiment import make
 from ginn_jax.lit_clouds import Cloud
 from ginn_jax.objects import Source
+from ginn_jax.pretrained import run_folder
 from ginn_jax.scenes import Settings, cloud_origin
 from ginn_jax.upsample import shading_step
 
@@ -72,9 +73,9 @@ class Options:
     """The same of the 2D-only network."""
     only_3d: Path | None = None
     """The same of the 3D-only network."""
-    beside: tuple[Path, ...] = ()
-    """The --out of runs of other networks of the effect, as of another width: beside
-    ours where error is compared with run time."""
+    beside: tuple[str, ...] = ()
+    """The --out of runs of other networks of the effect, as of another width, or names
+    as "ao_fine": beside ours where error is compared with run time."""
     meshes: Path | None = None
     """A mesh file or a folder of unseen meshes; left out, procedural shapes."""
     envmaps: Path | None = None
@@ -114,8 +115,8 @@ class Options:
 
 
 QUICK = {"objects": 1, "views": 1, "resolution": 64, "reference": 16, "points": 4000}
-QUICK |= {"counts": (1, 4), "disks": (), "scales": (0.5,), "fewer_looks": (32,)}
-QUICK |= {"draws": 2}
+QUICK |= {"counts": (1, 4), "disks": (), "scales": (0.5,), "draws": 2}
+QUICK |= {"fewer_looks": (32,)}
 
 
 def main(options: Options) -> dict[str, Any]:
@@ -126,8 +127,7 @@ def main(options: Options) -> dict[str, Any]:
     require_positive(options, "disks")
     require_shares(options, "shares")
     require_some(options, "counts")
-    for scale in options.scales:
-        shading_step(scale)
+    tuple(map(shading_step, options.scales))  # raises for what is no scale
     console = Console()
     targets = 64 if options.quick else TARGET_PATHS
     given = options.effect, options.points, targets, options.radius
@@ -136,7 +136,7 @@ def main(options: Options) -> dict[str, Any]:
     sources = compare.unseen_sources(*given, seed=options.seed)
     names = [source.name for source in sources]
     runs = options.checkpoint, options.only_2d, options.only_3d
-    warn_of_seen((*runs, *options.beside), names)
+    warn_of_seen((*runs, *map(run_folder, options.beside)), names)
     key = jax.random.key(options.seed)
     networks = load_networks(options.effect, settings, runs, key=key)
     settings = compare.with_looks(settings, options.looks)
@@ -144,7 +144,7 @@ def main(options: Options) -> dict[str, Any]:
     at_points, networks = errors_at_points(networks, clouds, sources, settings)
     networks |= {OURS + of_samples(s): networks[OURS] for s in options.shares}
     networks |= disk_variants(networks[OURS], options.disks)
-    networks |= other_runs(options.effect, settings, options.beside, key=key)
+    networks |= others_beside(options.effect, settings, options.beside, key=key)
     found = []
     for source, cloud in zip(sources, clouds, strict=True):
         console.print(f"{source.name}")

@@ -13,7 +13,7 @@ from ginn_jax.disk_radius import limits_at, with_disk_radius
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model
 from ginn_jax.limits import Limits
-from ginn_jax.pretrained import load_manifest, load_network
+from ginn_jax.pretrained import load_manifest, load_network, run_folder
 from ginn_jax.run_record import RECORD, damaged, read_record
 from ginn_jax.scenes import Occlusion, Settings
 
@@ -116,19 +116,26 @@ def check_radius(name: str, data: dict[str, Any], radius: float) -> None:
         )
 
 
-def other_runs(
-    effect: str, settings: Settings, runs: Sequence[Path], *, key: Key[Array, ""]
+def others_beside(
+    effect: str, settings: Settings, names: Sequence[str], *, key: Key[Array, ""]
 ) -> dict[str, Trained]:
-    """Networks of other finished runs of an effect, by the names of their folders.
+    """Other networks of an effect, of finished runs, by the names of their folders, or
+    of the package.
 
     Raises:
-        InputError: as `load_networks`, or two folders of one name.
+        InputError: as `load_networks`, a network of another effect, or two of one name.
     """
-    names = [f"{OTHER}{run.resolve().name}" for run in runs]
-    if len(set(names)) < len(names):
+    labels = [f"{OTHER}{Path(name).resolve().name}" for name in names]
+    if len(set(labels)) < len(labels):
         raise InputError("two of the runs beside have one name: rename a folder")
-    found = (load_trained(effect, settings, run, key=key) for run in runs)
-    return dict(zip(names, found, strict=True))
+    found = {}
+    for label, name in zip(labels, names, strict=True):
+        run = run_folder(name)
+        if run is None and name.split("_")[0] != effect:
+            raise InputError(f"--beside {name}: no network of {effect}, nor a folder")
+        own = effect if run else name
+        found[label] = load_trained(own, settings, run, key=key)
+    return found
 
 
 def of_samples(share: float) -> str:

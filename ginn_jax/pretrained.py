@@ -84,8 +84,13 @@ def starting_weights(name: str, config: Training) -> Variables:
 
 def load_any(name: str) -> tuple[Training, Limits, Variables]:
     """The network of a run, if `name` is a path or a folder, else `load_pretrained`."""
+    return load_network(name, run_folder(name))
+
+
+def run_folder(name: str) -> Path | None:
+    """The folder of the run that is meant; None for a network of the package."""
     run = Path(name)
-    return load_network(name, run if run.is_dir() or len(run.parts) > 1 else None)
+    return run if run.is_dir() or len(run.parts) > 1 else None
 
 
 def load_network(name: str, run: Path | None) -> tuple[Training, Limits, Variables]:

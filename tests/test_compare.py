@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments import evaluate as experiment
-from ginn_jax import blocks, checkpoint, report, run_record, scenes
+from ginn_jax import blocks, checkpoint, pretrained, report, run_record, scenes
 from ginn_jax.compare_figures import inset_place
-from ginn_jax.compare_networks import OURS, other_runs, redrawn, warn_of_seen
+from ginn_jax.compare_networks import OURS, others_beside, redrawn, warn_of_seen
 from ginn_jax.compare_report import (
     RIVALS,
     lost_cells,
@@ -99,6 +99,7 @@ def test_inset_lies_where_the_reference_varies():
 pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
 
+SETTINGS = scenes.Occlusion(2000, 8, radius=0.1)
 LEARNED = {"data": {"radius": 0.1}, "objects": ["cat", "duck__noon"]}
 
 
@@ -128,10 +129,21 @@ def test_draws_are_distinct_and_none_is_the_networks_own():
 
 
 def test_runs_beside_need_names_of_their_own(tmp_path):
-    runs = [tmp_path / "one" / "wide", tmp_path / "two" / "wide"]
-    settings = scenes.Occlusion(2000, 8, radius=0.1)
+    runs = [str(tmp_path / folder / "wide") for folder in ("one", "two")]
     with pytest.raises(InputError, match="one name"):
-        other_runs("ao", settings, runs, key=jax.random.key(0))
+        others_beside("ao", SETTINGS, runs, key=jax.random.key(0))
+
+
+@pytest.mark.parametrize("name", ["gi", "sss_only_2d", "nothing"])
+def test_networks_beside_are_of_the_same_effect(name):
+    with pytest.raises(InputError, match=f"--beside {name}: no network of ao"):
+        others_beside("ao", SETTINGS, [name], key=jax.random.key(0))
+
+
+def test_networks_of_the_package_stand_beside_by_name():
+    found = others_beside("ao", SETTINGS, ["ao_only_2d"], key=jax.random.key(0))
+    network, _, _ = found["run ao_only_2d"]
+    assert network == pretrained.load_pretrained("ao_only_2d")[0].network
 
 
 @pytest.mark.parametrize(
@@ -224,7 +236,7 @@ def test_comparison_ends_in_a_report_and_keeps_its_references(tmp_path):
         checkpoint=run,
         only_2d=run,
         only_3d=run,
-        beside=(run,),
+        beside=(str(run),),
         objects=1,
         views=1,
         resolution=48,
