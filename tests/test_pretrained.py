@@ -18,7 +18,7 @@ from ginn_jax.evaluate import Model
 MANIFEST = pretrained.load_manifest()
 FULL = ["ao", "gi", "sss"]
 NETWORKS = [name + part for name in FULL for part in ("", "_only_2d", "_only_3d")]
-NETWORKS += ["ao_fine"]
+NETWORKS += ["ao_fine", "sss_fine"]
 
 
 @cache
