@@ -93,8 +93,8 @@ def warn_of_seen(runs: Sequence[Path | None], scenes: Sequence[str]) -> None:
     """Say of each run which of these scenes have an object or a light by whose name it
     trained on one."""
     for run in filter(None, runs):
+        record = read_record(run / RECORD, "no run: name the --out of one")
         with damaged(run / RECORD, "train again"):
-            record = read_record(run / RECORD, "no run: name the --out of one")
             names = record.get("objects", [])
             seen = {part for name in names for part in name.split("__")}
         found = sorted({part for name in scenes for part in name.split("__")} & seen)
