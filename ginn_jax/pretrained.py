@@ -51,7 +51,8 @@ def load_manifest(folder: Path = FOLDER) -> dict[str, Record]:
 def load_pretrained(
     name: str, folder: Path = FOLDER
 ) -> tuple[Training, Limits, Variables]:
-    """Configuration, capacities and weights of "ao", "gi", "sss", and of ablations.
+    """Configuration, capacities and weights of "ao", "gi", "sss", of finer networks,
+    "ao_fine", "sss_fine", and of ablations.
 
     Raises:
         InputError: no network of that name, or a damaged file.
