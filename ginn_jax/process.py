@@ -26,19 +26,11 @@ TRIM_THRESHOLD, TOP_PAD, MMAP_MAX, ARENA_MAX = -1, -2, -4, -8
 def tune_process(devices: int | None = None) -> None:
     """Keep freed memory, and make every core a JAX device; call before any JAX work.
 
-    Sorting, scattering and prefix sums use one core; with a device per core a batch is
-    shared between them. Where neither applies (no glibc, a GPU) nothing happens.
-    """
-    keep_memory()
-    jax.config.update("jax_num_cpu_devices", devices or available_cores())
-
-
-def keep_memory() -> None:
-    """Keep freed memory, where glibc has it.
-
     XLA allocates its scratch memory anew for each call; glibc returns blocks that large
     to the kernel, so each call pays a page fault for every 4 KiB it touches: a
-    convolution's gradient runs two to three times faster with the memory kept.
+    convolution's gradient runs two to three times faster with the memory kept. Sorting,
+    scattering and prefix sums use one core; with a device per core a batch is shared
+    between them. Where neither applies (no glibc, a GPU) nothing happens.
     """
     try:
         libc = ctypes.CDLL(None)
@@ -48,6 +40,7 @@ def keep_memory() -> None:
         libc.mallopt(ARENA_MAX, 1)
     except (AttributeError, OSError, TypeError):
         pass
+    jax.config.update("jax_num_cpu_devices", devices or available_cores())
 
 
 def forget_programs() -> None:

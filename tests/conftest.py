@@ -24,13 +24,7 @@ settings.load_profile("ginn_jax")
 
 
 def pytest_configure(config):
-    """What XLA compiled is kept for other processes, their children and other runs.
-
-    Memory that was freed is kept as well: a tenth less time.
-    """
-    from ginn_jax.process import keep_memory  # after the hook, as below
-
-    keep_memory()
+    """What XLA compiled is kept for other processes, their children and other runs."""
     try:
         folder = str(config.cache.mkdir("xla"))
     except (AttributeError, OSError):  # no cache, or none that can be written
