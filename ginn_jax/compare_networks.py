@@ -84,27 +84,34 @@ def learned_from(name: str, run: Path | None) -> dict[str, Any]:
     """What made the targets that a network learned from."""
     if run is None:
         return load_manifest()[name]["data"]
-    path = run / RECORD
-    with damaged(path, "train again"):
-        return dict(read_record(path, "no run: name the --out of one")["data"])
+    record = _record(run)
+    with damaged(run / RECORD, "train again"):
+        return dict(record["data"])
 
 
 def warn_of_seen(runs: Sequence[Path | None], scenes: Sequence[str]) -> None:
     """Say of each run which of these scenes have an object or a light by whose name it
     trained on one."""
     for run in filter(None, runs):
-        record = read_record(run / RECORD, "no run: name the --out of one")
+        record = _record(run)
         with damaged(run / RECORD, "train again"):
-            names = record.get("objects", [])
-            seen = {part for name in names for part in name.split("__")}
-        found = sorted({part for name in scenes for part in name.split("__")} & seen)
-        if found:
+            seen = _parts(record.get("objects", []))
+        if found := sorted(_parts(scenes) & seen):
             LOG.warning(
                 "%s trained on what is called %s: its errors may be of scenes it has "
                 "seen",
                 run,
                 ", ".join(found),
             )
+
+
+def _record(run: Path) -> Any:
+    return read_record(run / RECORD, "no run: name the --out of one")
+
+
+def _parts(scenes: Sequence[str]) -> set[str]:
+    """The names of the objects and of the lights of scenes."""
+    return {part for name in scenes for part in name.split("__")}
 
 
 def check_radius(name: str, data: dict[str, Any], radius: float) -> None:
