@@ -36,8 +36,8 @@ class Options:
     """Ambient occlusion, global illumination or subsurface scattering."""
     out: Path = Path("runs/poisson_radii")
     """Folder for metrics.json, report.md and the figure."""
-    checkpoint: Path | None = None
-    """The --out of a training run; left out, the weights that come with the package."""
+    checkpoint: str | None = None
+    """The --out of a run, or a name as "ao_fine"; left out, the effect's network."""
     meshes: Path | None = None
     """A mesh file or a folder of meshes; left out, procedural shapes."""
     envmaps: Path | None = None
@@ -78,7 +78,10 @@ def main(options: Options) -> dict[str, Any]:
     settings = compare.effect_settings(options.effect, *counts, options.radius)
     settings = compare.with_looks(settings, options.looks)
     trained = load_trained(
-        options.effect, settings, options.checkpoint, key=jax.random.key(0)
+        options.effect,
+        settings,
+        options.checkpoint or options.effect,
+        key=jax.random.key(0),
     )
     networks = at_radii(trained, options.times)
     where = options.meshes, options.envmaps

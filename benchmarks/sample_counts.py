@@ -39,8 +39,8 @@ class Options:
     """Ambient occlusion, global illumination or subsurface scattering."""
     out: Path = Path("runs/sample_counts")
     """Folder for clouds, metrics.json and report.md."""
-    checkpoint: Path | None = None
-    """The --out of a training run; left out, the weights that come with the package."""
+    checkpoint: str | None = None
+    """The --out of a run, or a name as "ao_fine"; left out, the effect's network."""
     meshes: Path | None = None
     """A mesh file or a folder of meshes; left out, procedural shapes."""
     envmaps: Path | None = None
@@ -79,7 +79,10 @@ def main(options: Options) -> dict[str, Any]:
     settings = compare.effect_settings(options.effect, *counts, options.radius)
     settings = compare.with_looks(settings, options.looks)
     trained = load_trained(
-        options.effect, settings, options.checkpoint, key=jax.random.key(0)
+        options.effect,
+        settings,
+        options.checkpoint or options.effect,
+        key=jax.random.key(0),
     )
     where = options.meshes, options.envmaps
     sources = compare.unseen_sources(options.effect, options.objects, *where, seed=0)

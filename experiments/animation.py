@@ -55,11 +55,11 @@ class Options:
     """Ambient occlusion, global illumination or subsurface scattering."""
     out: Path = Path("runs/animation")
     """Folder for metrics.json, report.md, the strip and the moving image."""
-    checkpoint: Path | None = None
-    """The --out of a training run; left out, the weights that come with the package."""
-    only_2d: Path | None = None
+    checkpoint: str | None = None
+    """The --out of a run, or a name as "ao_fine"; left out, the effect's network."""
+    only_2d: str | None = None
     """The same of the 2D-only network."""
-    only_3d: Path | None = None
+    only_3d: str | None = None
     """The same of the 3D-only network."""
     beside: tuple[str, ...] = ()
     """The --out of runs of other networks of the effect, or names as "ao_fine"."""
@@ -106,8 +106,8 @@ def main(options: Options) -> dict[str, Any]:
     settings = compare.effect_settings(options.effect, *counts, options.radius)
     scenes = choose_sequences(options, ground=options.effect != "sss")
     light, key = choose_light(options), jax.random.key(options.seed)
-    runs = options.checkpoint, options.only_2d, options.only_3d
-    networks = load_networks(options.effect, settings, runs, key=key)
+    named = options.checkpoint, options.only_2d, options.only_3d
+    networks = load_networks(options.effect, settings, named, key=key)
     networks |= disk_variants(networks[OURS], options.disks)
     networks |= others_beside(options.effect, settings, options.beside, key=key)
     found = {}

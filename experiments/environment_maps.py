@@ -47,8 +47,8 @@ class Options:
     """Global illumination or subsurface scattering."""
     out: Path = Path("runs/environment_maps")
     """Folder for metrics.json, report.md and the figure."""
-    checkpoint: Path | None = None
-    """The --out of a training run; left out, the weights that come with the package."""
+    checkpoint: str | None = None
+    """The --out of a run, or a name as "ao_fine"; left out, the effect's network."""
     mesh: Path | None = None
     """A mesh file; left out, a procedural shape."""
     envmaps: Path | None = None
@@ -91,7 +91,9 @@ def main(options: Options) -> dict[str, Any]:
     mesh = mesh if scatters else add_ground(mesh)
     scene = build_scene(mesh)
     samples = visible_samples(scene, settings.points, options.seed, not scatters)
-    config, limits, weights = load_network(options.effect, options.checkpoint)
+    config, limits, weights = load_network(
+        options.effect, options.checkpoint or options.effect
+    )
     camera = orbit_camera(width=options.resolution, height=options.resolution)
     ready: Relightable | None = None
     rows, pictures = [], []

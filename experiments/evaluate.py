@@ -52,7 +52,6 @@ from ginn_jax.evaluate import Row, at_scale
 from ginn_jax.experiment import make
 from ginn_jax.lit_clouds import Cloud
 from ginn_jax.objects import Source
-from ginn_jax.pretrained import run_folder
 from ginn_jax.scenes import Settings, cloud_origin
 from ginn_jax.upsample import shading_step
 
@@ -67,11 +66,11 @@ class Options:
     """Ambient occlusion, global illumination or subsurface scattering."""
     out: Path = Path("runs/evaluate")
     """Folder for references, metrics.json, report.md and figures."""
-    checkpoint: Path | None = None
-    """The --out of a training run; left out, the weights that come with the package."""
-    only_2d: Path | None = None
+    checkpoint: str | None = None
+    """The --out of a run, or a name as "ao_fine"; left out, the effect's network."""
+    only_2d: str | None = None
     """The same of the 2D-only network."""
-    only_3d: Path | None = None
+    only_3d: str | None = None
     """The same of the 3D-only network."""
     beside: tuple[str, ...] = ()
     """The --out of runs of other networks of the effect, as of another width, or names
@@ -135,10 +134,10 @@ def main(options: Options) -> dict[str, Any]:
     given = options.effect, options.objects, options.meshes, options.envmaps
     sources = compare.unseen_sources(*given, seed=options.seed)
     names = [source.name for source in sources]
-    runs = options.checkpoint, options.only_2d, options.only_3d
-    warn_of_seen((*runs, *map(run_folder, options.beside)), names)
+    named = options.checkpoint, options.only_2d, options.only_3d
+    warn_of_seen((*named, *options.beside), names)
     key = jax.random.key(options.seed)
-    networks = load_networks(options.effect, settings, runs, key=key)
+    networks = load_networks(options.effect, settings, named, key=key)
     settings = compare.with_looks(settings, options.looks)
     clouds = make(console, "clouds", sources, settings, options.out / "clouds")
     at_points, networks = errors_at_points(networks, clouds, sources, settings)

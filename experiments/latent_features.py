@@ -42,8 +42,8 @@ class Options:
     """Whose network."""
     out: Path = Path("runs/latent_features")
     """Folder for the figure."""
-    checkpoint: Path | None = None
-    """The --out of a training run; left out, the weights that come with the package."""
+    checkpoint: str | None = None
+    """The --out of a run, or a name as "ao_fine"; left out, the effect's network."""
     mesh: Path | None = None
     """A mesh file; left out, a procedural shape."""
     channels: int = 4
@@ -94,7 +94,9 @@ def latent_code(
     options: Options, mesh: Mesh
 ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N K"]]:
     """Finest points and what f_3D says of them; of the first colour if there are."""
-    config, limits, weights = load_network(options.effect, options.checkpoint)
+    config, limits, weights = load_network(
+        options.effect, options.checkpoint or options.effect
+    )
     sheets = options.effect != "sss"
     settings = compare.effect_settings(options.effect, options.points, 2, 0.1)
     scene = build_scene(mesh)

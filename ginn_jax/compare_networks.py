@@ -30,33 +30,34 @@ NETWORKS = {OURS: "", **ABLATIONS}
 def load_networks(
     effect: str,
     settings: Settings,
-    runs: Sequence[Path | None],
+    names: Sequence[str | None],
     *,
     key: Key[Array, ""],
 ) -> dict[str, Trained]:
-    """Our network of an effect and its ablations, of finished runs or, for None, those
-    that come with the package.
+    """Our network of an effect and its ablations, as `load_trained`; for None those of
+    the package that were trained alike.
 
     Raises:
-        InputError: a network of another occlusion radius than that of `settings`.
+        InputError: as `load_trained`.
     """
     return {
-        name: load_trained(effect + ending, settings, run, key=key)
-        for (name, ending), run in zip(NETWORKS.items(), runs, strict=True)
+        method: load_trained(effect, settings, name or effect + ending, key=key)
+        for (method, ending), name in zip(NETWORKS.items(), names, strict=True)
     }
 
 
 def load_trained(
-    name: str, settings: Settings, run: Path | None, *, key: Key[Array, ""]
+    effect: str, settings: Settings, name: str, *, key: Key[Array, ""]
 ) -> Trained:
-    """The network of a finished run or, for None, the package's of that name.
+    """The network of a finished run, if its folder is named, or of the package.
 
     Raises:
-        InputError: as `load_networks`.
+        InputError: a network of the package of another effect, or one of another
+            occlusion radius than that of `settings`.
     """
-    config, limits, weights = load_network(name, run)
+    config, limits, weights = load_network(effect, name)
     if isinstance(settings, Occlusion):
-        check_radius(name, learned_from(name, run), settings.radius)
+        check_radius(name, learned_from(name), settings.radius)
     return config.network, limits, Model(weights, key)
 
 
@@ -80,8 +81,9 @@ def redrawn(trained: Trained, draws: int) -> list[Trained]:
     return [(network, limits, Model(variables, key)) for key in keys]
 
 
-def learned_from(name: str, run: Path | None) -> dict[str, Any]:
+def learned_from(name: str) -> dict[str, Any]:
     """What made the targets that a network learned from."""
+    run = run_folder(name)
     if run is None:
         return load_manifest()[name]["data"]
     record = _record(run)
@@ -89,10 +91,10 @@ def learned_from(name: str, run: Path | None) -> dict[str, Any]:
         return dict(record["data"])
 
 
-def warn_of_seen(runs: Sequence[Path | None], scenes: Sequence[str]) -> None:
-    """Say of each run which of these scenes have an object or a light by whose name it
-    trained on one."""
-    for run in filter(None, runs):
+def warn_of_seen(names: Sequence[str | None], scenes: Sequence[str]) -> None:
+    """Say of each run that is named which of these scenes have an object or a light by
+    whose name it trained on one."""
+    for run in filter(None, map(run_folder, filter(None, names))):
         record = _record(run)
         with damaged(run / RECORD, "train again"):
             seen = _parts(record.get("objects", []))
@@ -126,23 +128,18 @@ def check_radius(name: str, data: dict[str, Any], radius: float) -> None:
 def others_beside(
     effect: str, settings: Settings, names: Sequence[str], *, key: Key[Array, ""]
 ) -> dict[str, Trained]:
-    """Other networks of an effect, of finished runs, by the names of their folders, or
-    of the package.
+    """Other networks of an effect by the names of their folders or their own.
 
     Raises:
-        InputError: as `load_networks`, a network of another effect, or two of one name.
+        InputError: as `load_trained`, or two of one name.
     """
     labels = [f"{OTHER}{Path(name).resolve().name}" for name in names]
     if len(set(labels)) < len(labels):
         raise InputError("two of the runs beside have one name: rename a folder")
-    found = {}
-    for label, name in zip(labels, names, strict=True):
-        run = run_folder(name)
-        if run is None and name.split("_")[0] != effect:
-            raise InputError(f"--beside {name}: no network of {effect}, nor a folder")
-        own = effect if run else name
-        found[label] = load_trained(own, settings, run, key=key)
-    return found
+    return {
+        label: load_trained(effect, settings, name, key=key)
+        for label, name in zip(labels, names, strict=True)
+    }
 
 
 def of_samples(share: float) -> str:

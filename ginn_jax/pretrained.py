@@ -83,20 +83,27 @@ def starting_weights(name: str, config: Training) -> Variables:
     return weights
 
 
+def load_network(effect: str, name: str) -> tuple[Training, Limits, Variables]:
+    """`load_any` of an effect.
+
+    Raises:
+        InputError: as `load_any`, or a network of the package of another effect.
+    """
+    if run_folder(name) is None and name.split("_")[0] != effect:
+        raise InputError(f"{name} is no network of {effect}, nor the folder of a run")
+    return load_any(name)
+
+
 def load_any(name: str) -> tuple[Training, Limits, Variables]:
     """The network of a run, if `name` is a path or a folder, else `load_pretrained`."""
-    return load_network(name, run_folder(name))
+    run = run_folder(name)
+    return load_pretrained(name) if run is None else load_weights(run)
 
 
 def run_folder(name: str) -> Path | None:
     """The folder of the run that is meant; None for a network of the package."""
     run = Path(name)
     return run if run.is_dir() or len(run.parts) > 1 else None
-
-
-def load_network(name: str, run: Path | None) -> tuple[Training, Limits, Variables]:
-    """The network of a finished run or, for None, the package's of that name."""
-    return load_pretrained(name) if run is None else load_weights(run)
 
 
 def read_weights(path: Path, config: Training) -> Variables:

@@ -136,7 +136,7 @@ def test_runs_beside_need_names_of_their_own(tmp_path):
 
 @pytest.mark.parametrize("name", ["gi", "sss_only_2d", "nothing"])
 def test_networks_beside_are_of_the_same_effect(name):
-    with pytest.raises(InputError, match=f"--beside {name}: no network of ao"):
+    with pytest.raises(InputError, match=f"{name} is no network of ao"):
         others_beside("ao", SETTINGS, [name], key=jax.random.key(0))
 
 
@@ -152,7 +152,7 @@ def test_networks_of_the_package_stand_beside_by_name():
 )
 def test_scenes_that_a_run_trained_on_are_named(scene, seen, tmp_path, caplog):
     run_record.save_run(tmp_path, tiny.CONFIG, tiny.ROOM, LEARNED)
-    warn_of_seen((None, tmp_path), ["cow__dusk", scene])
+    warn_of_seen((None, "ao", str(tmp_path)), ["cow__dusk", scene])
     said = [record.getMessage() for record in caplog.records]
     assert len(said) == bool(seen)
     assert not seen or f"called {seen}: " in said[0]
@@ -174,9 +174,9 @@ def test_light_is_compared_with_tracing_plain_and_denoised(tmp_path, monkeypatch
     options = experiment.Options(
         "sss",
         out=tmp_path / "out",
-        checkpoint=ours,
-        only_2d=ours,
-        only_3d=splats,
+        checkpoint=str(ours),
+        only_2d=str(ours),
+        only_3d=str(splats),
         objects=1,
         views=1,
         resolution=40,
@@ -233,9 +233,9 @@ def test_comparison_ends_in_a_report_and_keeps_its_references(tmp_path):
     options = experiment.Options(
         "ao",
         out=tmp_path / "out",
-        checkpoint=run,
-        only_2d=run,
-        only_3d=run,
+        checkpoint=str(run),
+        only_2d=str(run),
+        only_3d=str(run),
         beside=(str(run),),
         objects=1,
         views=1,

@@ -36,9 +36,10 @@ def tiny_networks(monkeypatch):
     # Every picture has full blocks, so one shape is compiled.
     monkeypatch.setattr(blocks, "BLOCK", 128)
 
-    def load(name, run):
-        given = name, run
-        return pretrained.load_network(*given) if run else untrained(name.split("_")[0])
+    def load(effect, name):
+        if pretrained.run_folder(name):
+            return pretrained.load_network(effect, name)
+        return untrained(effect)
 
     for module in (compare_networks, environment_maps, latent_features):
         monkeypatch.setattr(module, "load_network", load)
@@ -79,7 +80,7 @@ SCRIPTS = animation, environment_maps, evaluate, latent_features
 
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_networks_of_runs_are_taken_where_they_are_named(tmp_path, script):
-    options = script.Options(out=tmp_path / "out", checkpoint=tmp_path)
+    options = script.Options(out=tmp_path / "out", checkpoint=str(tmp_path))
     with pytest.raises(InputError, match="no run: name the --out of one"):
         script.main(options)
 

@@ -17,6 +17,8 @@ from ginn_jax import hierarchy as hi
 from ginn_jax.errors import InputError
 from ginn_jax.voxels import build_grid
 
+pytestmark = pytest.mark.usefixtures("cheap_compiling")
+
 NORMAL = np.arange(3.0 * POINTS, dtype=np.float32).reshape(POINTS, 3)
 # On the host each number of conflicts is compiled anew.
 FEWER = settings(max_examples=12)

@@ -3,7 +3,6 @@
 import jax
 import numpy as np
 import pytest
-import tiny
 from hypothesis import given
 from hypothesis import strategies as st
 from oracles import neighbors
@@ -16,6 +15,8 @@ pick = jax.jit(pk.select_bit)
 search = jax.jit(pk.radius_edges, static_argnames=("limit", "packet"))
 sizes = pytest.mark.parametrize("packet", [PACKET, DENSE_PACKET])
 make_grid = jax.jit(vx.build_grid)
+pytestmark = pytest.mark.usefixtures("cheap_compiling")
+
 ROOM = pk.EdgeLimit(4096, 1 << 15, 1024, 1 << 15)
 
 
@@ -68,12 +69,6 @@ def test_lists_of_several_words_and_a_last_packet_that_is_not_full(crowd, packet
 @sizes
 def test_exact_limits_suffice_and_one_less_is_told(crowd, packet):
     points, queries = crowd
-    with tiny.cheap_compiling():
-        check_limits(points, queries, packet)
-
-
-def check_limits(points, queries, packet):
-    """Every limit at its demand, then each in turn at one less."""
     full, demand = pairs(points, queries, 0.3, packet)
     exact = pk.EdgeLimit(*(int(need) for need in demand))
     assert pairs(points, queries, 0.3, packet, exact) == (full, demand)

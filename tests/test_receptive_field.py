@@ -13,6 +13,8 @@ from ginn_jax.hierarchy import same_side
 from ginn_jax.packets import EdgeLimit, radius_edges
 from ginn_jax.voxels import build_grid
 
+pytestmark = pytest.mark.usefixtures("cheap_compiling")
+
 
 @given(cases(), SEEDS)
 def test_rotation_turns_offsets_and_keeps_products(case, seed):

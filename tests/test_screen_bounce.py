@@ -1,9 +1,12 @@
 """One bounce on the screen: against the integral, blocked, and what it misses."""
 
+from contextlib import nullcontext
+
 import jax
 import numpy as np
 import pytest
 import seen
+import tiny
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -23,7 +26,10 @@ METHODS = pytest.mark.parametrize(
 
 def bounced(method, scene, exitance, options):
     run = seen.compiled(method, scene.camera, *options.items())
-    return np.asarray(run(*scene.surface, exitance))
+    # The window's 10^4 pairs a pixel take longer than to compile them well.
+    brief = method is bitmask_irradiance
+    with tiny.cheap_compiling() if brief else nullcontext():
+        return np.asarray(run(*scene.surface, exitance))
 
 
 def sent(scene, part, color=COLOR):

@@ -12,6 +12,8 @@ from ginn_jax.mesh import Mesh
 from ginn_jax.reference import ambient_occlusion as traced
 from ginn_jax.screen_occlusion import ambient_occlusion, bitmask_occlusion
 
+pytestmark = pytest.mark.usefixtures("cheap_compiling")
+
 SIZE = 48
 METHODS = pytest.mark.parametrize("method", [ambient_occlusion, bitmask_occlusion])
 

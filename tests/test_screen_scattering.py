@@ -16,6 +16,8 @@ from ginn_jax.screen_scattering import radiant_exitance
 from ginn_jax.slab import external_reflectance
 from ginn_jax.subsurface import Medium, subsurface_exitance
 
+pytestmark = pytest.mark.usefixtures("cheap_compiling")
+
 SIZE = 48
 ALBEDO = np.array([0.9, 0.5, 0.2], np.float32)
 ABOVE = orbit_camera(0.0, 89.0, 2.2, width=SIZE, height=SIZE)

@@ -21,6 +21,8 @@ from ginn_jax.upsample import (
     shading_step,
 )
 
+pytestmark = pytest.mark.usefixtures("cheap_compiling")
+
 SIZE = 16
 UP = np.array([0.0, 1, 0], np.float32)
 
