@@ -6,7 +6,7 @@ from left_behind import check_files
 
 from benchmarks import mc_conv, neighbors
 
-pytestmark = pytest.mark.usefixtures("at_once")
+pytestmark = pytest.mark.usefixtures("at_once", "cheap_compiling")
 
 
 def test_pairs_may_differ_at_the_radius_only():
