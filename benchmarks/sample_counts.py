@@ -79,10 +79,7 @@ def main(options: Options) -> dict[str, Any]:
     settings = compare.effect_settings(options.effect, *counts, options.radius)
     settings = compare.with_looks(settings, options.looks)
     trained = load_trained(
-        options.effect,
-        settings,
-        options.checkpoint or options.effect,
-        key=jax.random.key(0),
+        options.effect, settings, options.checkpoint, key=jax.random.key(0)
     )
     where = options.meshes, options.envmaps
     sources = compare.unseen_sources(options.effect, options.objects, *where, seed=0)

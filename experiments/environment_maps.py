@@ -91,9 +91,7 @@ def main(options: Options) -> dict[str, Any]:
     mesh = mesh if scatters else add_ground(mesh)
     scene = build_scene(mesh)
     samples = visible_samples(scene, settings.points, options.seed, not scatters)
-    config, limits, weights = load_network(
-        options.effect, options.checkpoint or options.effect
-    )
+    config, limits, weights = load_network(options.effect, options.checkpoint)
     camera = orbit_camera(width=options.resolution, height=options.resolution)
     ready: Relightable | None = None
     rows, pictures = [], []

@@ -94,9 +94,7 @@ def latent_code(
     options: Options, mesh: Mesh
 ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N K"]]:
     """Finest points and what f_3D says of them; of the first colour if there are."""
-    config, limits, weights = load_network(
-        options.effect, options.checkpoint or options.effect
-    )
+    config, limits, weights = load_network(options.effect, options.checkpoint)
     sheets = options.effect != "sss"
     settings = compare.effect_settings(options.effect, options.points, 2, 0.1)
     scene = build_scene(mesh)

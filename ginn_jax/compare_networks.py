@@ -47,14 +47,16 @@ def load_networks(
 
 
 def load_trained(
-    effect: str, settings: Settings, name: str, *, key: Key[Array, ""]
+    effect: str, settings: Settings, name: str | None, *, key: Key[Array, ""]
 ) -> Trained:
-    """The network of a finished run, if its folder is named, or of the package.
+    """The network of a finished run, if its folder is named, or of the package; for
+    None the package's that is named as the effect.
 
     Raises:
         InputError: a network of the package of another effect, or one of another
             occlusion radius than that of `settings`.
     """
+    name = name or effect
     config, limits, weights = load_network(effect, name)
     if isinstance(settings, Occlusion):
         check_radius(name, learned_from(name), settings.radius)

@@ -83,12 +83,13 @@ def starting_weights(name: str, config: Training) -> Variables:
     return weights
 
 
-def load_network(effect: str, name: str) -> tuple[Training, Limits, Variables]:
-    """`load_any` of an effect.
+def load_network(effect: str, name: str | None) -> tuple[Training, Limits, Variables]:
+    """`load_any` of an effect; for None the network that is named as the effect.
 
     Raises:
         InputError: as `load_any`, or a network of the package of another effect.
     """
+    name = name or effect
     if run_folder(name) is None and name.split("_")[0] != effect:
         raise InputError(f"{name} is no network of {effect}, nor the folder of a run")
     return load_any(name)

@@ -83,6 +83,15 @@ def cheap_compiling():
 
 
 @pytest.fixture
+def full_compiling(cheap_compiling):
+    """For tests of such modules whose results have to be those of users' programs."""
+    import tiny
+
+    with tiny.full_compiling():
+        yield
+
+
+@pytest.fixture
 def at_once(monkeypatch):
     """Nothing is warmed up: times are not looked at."""
     from benchmarks import timing  # after the hook, as above

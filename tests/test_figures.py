@@ -37,7 +37,7 @@ def tiny_networks(monkeypatch):
     monkeypatch.setattr(blocks, "BLOCK", 128)
 
     def load(effect, name):
-        if pretrained.run_folder(name):
+        if name and pretrained.run_folder(name):
             return pretrained.load_network(effect, name)
         return untrained(effect)
 

@@ -80,6 +80,7 @@ def test_host_sample_is_maximal_and_spaced(points, radius, seed):
     assert_maximal(points, set(kept.tolist()), radius)
 
 
+@pytest.mark.usefixtures("full_compiling")
 @FEWER
 @given(clouds(), RADII, SEEDS)
 def test_host_sample_equals_dart_throwing(points, radius, seed):
@@ -98,6 +99,7 @@ def test_jitted_sample_is_maximal_and_keeps_no_masked_point(cloud, radius, seed)
     assert_maximal(points, real_kept, float(np.float32(radius)), 1e-6)
 
 
+@pytest.mark.usefixtures("full_compiling")
 @given(padded(), SEEDS)
 def test_jitted_sample_equals_dart_throwing(cloud, seed):
     """Of the points that count, with their own lots; .3 is no distance drawn here."""

@@ -5,7 +5,6 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-import tiny
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -31,22 +30,8 @@ from ginn_jax.candidates import PACKET
 from ginn_jax.errors import InputError
 
 INT32_MAX = 2**31 - 1
-# Tests of the code that users' calls compile to; the others' compiles cheaply.
-AS_USERS_COMPILE = {
-    "test_host_search_equals_brute_force",
-    "test_jitted_search_equals_brute_force_but_for_rounding",
-}
 
-
-@pytest.fixture(autouse=True)
-def _compiling(request):
-    if request.node.originalname not in AS_USERS_COMPILE:
-        with tiny.cheap_compiling():
-            yield
-        return
-    jax.clear_caches()
-    yield
-    jax.clear_caches()
+pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
 
 def found(points, queries, radius):
@@ -91,6 +76,7 @@ def sandwich(points, queries, radius):
     ]
 
 
+@pytest.mark.usefixtures("full_compiling")
 @given(clouds(), clouds(), RADII, st.sampled_from([0, nb.MANY]))
 def test_host_search_equals_brute_force(points, queries, radius, many):
     points, queries = points.astype(np.float64), queries.astype(np.float64)
@@ -175,6 +161,7 @@ def test_jitted_search_finds_what_lies_on_the_far_border(radius):
         assert pairs_of(edges_of(cloud, cloud, radius), cloud) >= {(0, 0), (1, 1)}
 
 
+@pytest.mark.usefixtures("full_compiling")
 @settings(max_examples=50)
 @given(padded(), padded(QUERIES), RADII)
 def test_jitted_search_equals_brute_force_but_for_rounding(points, queries, radius):

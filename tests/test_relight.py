@@ -19,9 +19,10 @@ LOCAL = replace(tiny.ONE_LEVEL, materials=3, lights=1, asks="all", local=True)
 # Pooling and its way back once for what is linear, and once where nothing but f_3D can
 # be nonlinear.
 EFFECTS = {
-    "linear": replace(tiny.NETWORK, linear=True, materials=1, lights=1, smooth=0.1),
+    "linear": replace(tiny.NETWORK, linear=True, materials=1, lights=1),
     "homogeneous": replace(tiny.ONE_LEVEL, materials=1, lights=1),
     "beams": replace(LOCAL, beams=2),
+    "smooth": replace(LOCAL, linear=True, local=False, smooth=0.1),
     "only_2d": only_2d(LOCAL),
     "only_3d": only_3d(
         replace(tiny.NETWORK, materials=3, lights=1, asks="all", local=True, beams=2)

@@ -104,6 +104,7 @@ SIMPLE = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_cpu_parallel_codegen_split_count": 1,
 }
+GIVEN_OPTIONS = compiler.get_compile_options
 
 
 @contextmanager
@@ -112,17 +113,31 @@ def cheap_compiling():
 
     JAX has no setting for what is in `SIMPLE`.
     """
-    given = compiler.get_compile_options
 
     def simple(*args, **options):
         overrides = options.get("env_options_overrides") or {}
         overrides = SIMPLE | overrides
-        return given(*args, **options | {"env_options_overrides": overrides})
+        return GIVEN_OPTIONS(*args, **options | {"env_options_overrides": overrides})
 
+    with _compiling(simple, unoptimised=True):
+        yield
+
+
+@contextmanager
+def full_compiling():
+    """Within `cheap_compiling`, what users' calls compile to, and nothing else."""
+    jax.clear_caches()
+    with _compiling(GIVEN_OPTIONS, unoptimised=False):
+        yield
+    jax.clear_caches()
+
+
+@contextmanager
+def _compiling(get_options, unoptimised):
     before = jax.config.values["jax_disable_most_optimizations"]
-    jax.config.update("jax_disable_most_optimizations", True)
+    jax.config.update("jax_disable_most_optimizations", unoptimised)
     try:
-        with mock.patch.object(compiler, "get_compile_options", simple):
+        with mock.patch.object(compiler, "get_compile_options", get_options):
             yield
     finally:
         jax.config.update("jax_disable_most_optimizations", before)
