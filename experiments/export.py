@@ -16,10 +16,8 @@ from rich.console import Console
 
 from ginn_jax import compare, evaluate, evaluate_light
 from ginn_jax.architecture import Network
-from ginn_jax.checkpoint import load_weights
 from ginn_jax.commandline import start
 from ginn_jax.dataset import count_asked
-from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model
 from ginn_jax.limits import Limits
 from ginn_jax.lit_scenes import lit_cloud
@@ -30,7 +28,7 @@ from ginn_jax.objects import (
     procedural_sources,
 )
 from ginn_jax.pairing import pair_up
-from ginn_jax.pretrained import FOLDER, export
+from ginn_jax.pretrained import FOLDER, export, load_network
 from ginn_jax.scenes import Occlusion, occlusion_cloud
 
 FIXED_POINTS, FIXED_COUNT = 20_000, 64
@@ -52,8 +50,8 @@ class Options:
 
 def main(options: Options) -> Path:
     """Write the files; returns the path of the weights."""
-    effect = effect_of(options.name)
-    config, limits, weights = load_weights(options.run)
+    effect = options.name.split("_")[0]
+    config, limits, weights = load_network(effect, str(options.run))
     model = Model(weights, jax.random.key(0))
     error = fixed_scene_error(effect, config.network, limits, model)
     more = {"command": options.command, "fixed_scene_relative_mse_3d": error}
@@ -61,14 +59,6 @@ def main(options: Options) -> Path:
     size = path.stat().st_size / 1024
     Console().print(f"{path}: {size:.0f} KiB, {error:.4f} on the fixed scene")
     return path
-
-
-def effect_of(name: str) -> str:
-    """The effect that a network's name begins with."""
-    effect = name.split("_")[0]
-    if effect not in ("ao", "gi", "sss"):
-        raise InputError(f"--name is {name}: let it begin with ao, gi or sss")
-    return effect
 
 
 def fixed_scene_error(

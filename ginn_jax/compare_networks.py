@@ -53,8 +53,8 @@ def load_trained(
     None the package's that is named as the effect.
 
     Raises:
-        InputError: a network of the package of another effect, or one of another
-            occlusion radius than that of `settings`.
+        InputError: a network of another effect, or one of another occlusion radius
+            than that of `settings`.
     """
     name = name or effect
     config, limits, weights = load_network(effect, name)

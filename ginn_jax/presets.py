@@ -190,3 +190,19 @@ ILLUMINATION = for_light(_DIFFUSE)
 
 # Albedo, extinction and index of refraction, and the irradiance.
 SCATTERING = for_light(replace(_DENSE, materials=3, asks="all", local=True, beams=8))
+
+
+DEFAULTS = {
+    "ao": DEFAULT,
+    "gi": ILLUMINATION["homogeneous"],
+    "sss": SCATTERING["homogeneous"],
+}
+
+
+def effect_of(network: Network) -> str | None:
+    """The effect whose networks take these numbers of material and light, if any."""
+    taken = network.materials, network.lights
+    for effect, default in DEFAULTS.items():
+        if taken == (default.materials, default.lights):
+            return effect
+    return None

@@ -17,6 +17,7 @@ from ginn_jax.errors import InputError
 from ginn_jax.files import writing
 from ginn_jax.limits import Limits
 from ginn_jax.network import Variables
+from ginn_jax.presets import effect_of
 from ginn_jax.recipe import Training
 from ginn_jax.run_record import (
     RECORD,
@@ -87,12 +88,13 @@ def load_network(effect: str, name: str | None) -> tuple[Training, Limits, Varia
     """`load_any` of an effect; for None the network that is named as the effect.
 
     Raises:
-        InputError: as `load_any`, or a network of the package of another effect.
+        InputError: as `load_any`, or a network of another effect.
     """
     name = name or effect
-    if run_folder(name) is None and name.split("_")[0] != effect:
-        raise InputError(f"{name} is no network of {effect}, nor the folder of a run")
-    return load_any(name)
+    found = load_any(name)
+    if effect_of(found[0].network) != effect:
+        raise InputError(f"{name} is no network of {effect}: name one that is")
+    return found
 
 
 def load_any(name: str) -> tuple[Training, Limits, Variables]:

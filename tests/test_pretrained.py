@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import tiny
 
-from experiments.export import effect_of, fixed_scene_error
-from ginn_jax import checkpoint, fit, pretrained, report, run_record
+from experiments.export import fixed_scene_error
+from ginn_jax import checkpoint, fit, presets, pretrained, report, run_record
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model
 
@@ -55,6 +55,22 @@ def test_weights_come_back_bit_for_bit(exported):
     errors = pretrained.load_manifest(folder)["ao"]["errors"]
     assert list(errors) == ["unseen shapes"]
     assert errors["unseen shapes"]["relative_mse_3d"] == 0.5
+
+
+@pytest.mark.parametrize("effect", ["gi", "sss"])
+def test_a_run_of_another_effect_is_refused(exported, effect):
+    _, _, run = exported
+    config, _, _ = pretrained.load_network("ao", str(run))
+    assert config == tiny.CONFIG
+    with pytest.raises(InputError, match=f"is no network of {effect}: name"):
+        pretrained.load_network(effect, str(run))
+
+
+@pytest.mark.parametrize("effect", ["gi", "sss"])
+@pytest.mark.parametrize("preset", presets.ILLUMINATION)
+def test_every_preset_tells_its_effect(effect, preset):
+    every = {"gi": presets.ILLUMINATION, "sss": presets.SCATTERING}
+    assert presets.effect_of(every[effect][preset]) == effect
 
 
 def test_errors_are_named_by_their_set(exported, tmp_path):
@@ -153,7 +169,9 @@ def test_every_network_loads_and_is_small(name):
 def test_the_error_on_the_fixed_scene_is_the_stored_one(name):
     """One of them in the code that users' calls compile to."""
     config, limits, weights = shipped(name)
-    given = effect_of(name), config.network, limits
+    effect = presets.effect_of(config.network)
+    assert effect == name.split("_")[0]
+    given = effect, config.network, limits
     with nullcontext() if name == "ao" else tiny.cheap_compiling():
         error = fixed_scene_error(*given, Model(weights, jax.random.key(0)))
     stored = MANIFEST[name]["fixed_scene_relative_mse_3d"]
