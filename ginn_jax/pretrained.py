@@ -52,8 +52,8 @@ def load_manifest(folder: Path = FOLDER) -> dict[str, Record]:
 def load_pretrained(
     name: str, folder: Path = FOLDER
 ) -> tuple[Training, Limits, Variables]:
-    """Configuration, capacities and weights of "ao", "gi", "sss", of networks on finer
-    and coarser disks, "ao_fine", "sss_fine", "ao_coarse", and of ablations.
+    """Configuration, capacities and weights of "ao", "gi", "sss", of finer networks,
+    "ao_fine", "sss_fine", and of ablations.
 
     Raises:
         InputError: no network of that name, or a damaged file.

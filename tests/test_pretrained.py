@@ -17,9 +17,9 @@ from ginn_jax.evaluate import Model
 
 MANIFEST = pretrained.load_manifest()
 FULL = ["ao", "gi", "sss"]
-OTHER_DISKS = ["ao_coarse", "ao_fine", "sss_fine"]
+FINE = ["ao_fine", "sss_fine"]
 NETWORKS = [name + part for name in FULL for part in ("", "_only_2d", "_only_3d")]
-NETWORKS += OTHER_DISKS
+NETWORKS += FINE
 
 
 @cache
@@ -165,7 +165,7 @@ def test_every_network_loads_and_is_small(name):
     assert (pretrained.FOLDER / f"{name}.npz").stat().st_size < 2e6
 
 
-@pytest.mark.parametrize("name", FULL + OTHER_DISKS)
+@pytest.mark.parametrize("name", FULL + FINE)
 def test_the_error_on_the_fixed_scene_is_the_stored_one(name):
     """One of them in the code that users' calls compile to."""
     config, limits, weights = shipped(name)
