@@ -52,9 +52,9 @@ class Options:
     """Side of the frame in pixels."""
     points: int = 20_000
     """Samples of the object before the disk."""
-    disks: tuple[float, ...] = (0.01, 0.02, 0.02)
+    disks: tuple[float, ...] = (0.01, 0.01, 0.02, 0.02)
     """Poisson disk radii of the finest level, one for each f_2D radius."""
-    radii: tuple[float, ...] = (0.025, 0.035, 0.05)
+    radii: tuple[float, ...] = (0.02, 0.025, 0.035, 0.05)
     """f_2D radii."""
     hidden: int = 16
     """Width of the kernel perceptron."""
