@@ -16,8 +16,10 @@ from rich.console import Console
 
 from ginn_jax import compare, evaluate, evaluate_light
 from ginn_jax.architecture import Network
+from ginn_jax.checkpoint import load_weights
 from ginn_jax.commandline import start
 from ginn_jax.dataset import count_asked
+from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model
 from ginn_jax.limits import Limits
 from ginn_jax.lit_scenes import lit_cloud
@@ -28,7 +30,8 @@ from ginn_jax.objects import (
     procedural_sources,
 )
 from ginn_jax.pairing import pair_up
-from ginn_jax.pretrained import FOLDER, export, load_network
+from ginn_jax.presets import effect_of
+from ginn_jax.pretrained import FOLDER, export
 from ginn_jax.scenes import Occlusion, occlusion_cloud
 
 FIXED_POINTS, FIXED_COUNT = 20_000, 64
@@ -50,8 +53,13 @@ class Options:
 
 def main(options: Options) -> Path:
     """Write the files; returns the path of the weights."""
+    config, limits, weights = load_weights(options.run)
     effect = options.name.split("_")[0]
-    config, limits, weights = load_network(effect, str(options.run))
+    if effect != effect_of(config.network):
+        raise InputError(
+            f"--name is {options.name}: let it begin with ao, gi or sss, whichever "
+            f"{options.run} learned"
+        )
     model = Model(weights, jax.random.key(0))
     error = fixed_scene_error(effect, config.network, limits, model)
     more = {"command": options.command, "fixed_scene_relative_mse_3d": error}

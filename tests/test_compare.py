@@ -134,9 +134,16 @@ def test_runs_beside_need_names_of_their_own(tmp_path):
         others_beside("ao", SETTINGS, runs, key=jax.random.key(0))
 
 
-@pytest.mark.parametrize("name", ["gi", "sss_only_2d"])
-def test_networks_beside_are_of_the_same_effect(name):
-    with pytest.raises(InputError, match=f"{name} is no network of ao"):
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("gi", "gi is no network of ao"),
+        ("sss_only_2d", "sss_only_2d is no network of ao"),
+        ("nothing", "no trained network 'nothing'"),
+    ],
+)
+def test_networks_beside_are_of_the_same_effect(name, message):
+    with pytest.raises(InputError, match=message):
         others_beside("ao", SETTINGS, [name], key=jax.random.key(0))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tiny
 
-from experiments.export import fixed_scene_error
+from experiments import export
 from ginn_jax import checkpoint, fit, presets, pretrained, report, run_record
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model
@@ -64,6 +64,14 @@ def test_a_run_of_another_effect_is_refused(exported, effect):
     assert config == tiny.CONFIG
     with pytest.raises(InputError, match=f"is no network of {effect}: name"):
         pretrained.load_network(effect, str(run))
+
+
+@pytest.mark.parametrize("name", ["gi", "sss_only_2d", "nothing"])
+def test_a_run_is_not_exported_under_another_effect(exported, tmp_path, name):
+    _, _, run = exported
+    with pytest.raises(InputError, match=f"^--name is {name}: let it begin"):
+        export.main(export.Options(run, name, "none", tmp_path))
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("effect", ["gi", "sss"])
@@ -173,6 +181,6 @@ def test_the_error_on_the_fixed_scene_is_the_stored_one(name):
     assert effect == name.split("_")[0]
     given = effect, config.network, limits
     with nullcontext() if name == "ao" else tiny.cheap_compiling():
-        error = fixed_scene_error(*given, Model(weights, jax.random.key(0)))
+        error = export.fixed_scene_error(*given, Model(weights, jax.random.key(0)))
     stored = MANIFEST[name]["fixed_scene_relative_mse_3d"]
     assert error == pytest.approx(stored, rel=0.05)
