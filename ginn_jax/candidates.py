@@ -15,7 +15,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ginn_jax.ranges import Slots, fill, range_slots, saturating_sum
+from ginn_jax.ranges import Slots, fill, range_slots, saturating_sum, tiles_holding
 from ginn_jax.voxels import VoxelGrid, cell_of, narrow_runs
 
 PACKET, DENSE_PACKET = 32, 128
@@ -125,4 +125,4 @@ def _column_run(
 
 def count_words(near: Candidates) -> Int[Array, ""]:
     """How many lists of 32 candidates there are."""
-    return jnp.sum(-(-near.count // WORD), dtype=jnp.int32)
+    return jnp.sum(tiles_holding(near.count, WORD), dtype=jnp.int32)

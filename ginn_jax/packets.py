@@ -22,7 +22,7 @@ from ginn_jax.candidates import (
     packet_candidates,
     packet_columns,
 )
-from ginn_jax.ranges import Slots, fill, prefix_sum, range_slots
+from ginn_jax.ranges import Slots, fill, prefix_sum, range_slots, tiles_holding
 from ginn_jax.voxels import VoxelGrid
 
 # Words that are computed at a time.
@@ -122,7 +122,7 @@ def packet_words(
 
     `number` are the queries' own numbers, a permutation, if they are not in order.
     """
-    lists = -(-near.count // WORD)
+    lists = tiles_holding(near.count, WORD)
     slots = range_slots(lists, capacity)
     packet = query.shape[0] // lists.shape[0]
     point, bit = grid.position.T, jnp.arange(WORD, dtype=jnp.int32)
@@ -219,7 +219,7 @@ def list_bits(
         rank = slots.owner[slot]
         place = words.order[rank]
         bit = select_bit(flat[place], slot - slots.begin[rank])
-        row = words.first[place // packet] + bit
+        row = words.first[jax.lax.div(place, jnp.int32(packet))] + bit
         return near.row[jnp.where(slot < slots.total, row, 0)], query[place]
 
     valid = jnp.arange(capacity, dtype=jnp.int32) < slots.total

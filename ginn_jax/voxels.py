@@ -149,7 +149,7 @@ def narrow_runs(
         _: Int[Array, ""], state: tuple[Int[Array, "*K"], ...]
     ) -> tuple[Array, ...]:
         a, b, c, d = state
-        left, right = (a + b) // 2, (c + d) // 2
+        left, right = (a + b) >> 1, (c + d) >> 1
         up = (a < b) & (layer[left] < low)
         a, b = jnp.where(up, left + 1, a), jnp.where(up, b, left)
         up = (c < d) & (layer[right] < high)
