@@ -109,7 +109,7 @@ def range_slots(
     padded = jnp.pad(length, (0, -count % max(size, 1)))
 
     def open_slots(tile: Int[Array, ""], state: tuple[Array, ...]) -> tuple[Array, ...]:
-        begin, opened, used = state
+        begin, opened, used, least = state
         some = jax.lax.dynamic_slice_in_dim(padded, tile * size, size)
         stop = used + prefix_sum(some)
         real = tile * size + jnp.arange(size, dtype=jnp.int32) < listed
@@ -117,12 +117,15 @@ def range_slots(
         begin = jax.lax.dynamic_update_slice_in_dim(
             begin, stop - some, tile * size, axis=0
         )
-        return begin, opened.at[place].add(1, mode="drop"), stop[-1]
+        opened = opened.at[place].add(1, mode="drop")
+        # Of sums that leave int32, the first wraps to below zero.
+        return begin, opened, stop[-1], jnp.minimum(least, jnp.min(stop, initial=0))
 
-    nothing = jnp.zeros_like(padded), jnp.zeros(capacity, jnp.int32), jnp.int32(0)
+    zero = jnp.int32(0)
+    nothing = jnp.zeros_like(padded), jnp.zeros(capacity, jnp.int32), zero, zero
     tiles = tiles_holding(listed, size)
-    begin, opened, _ = jax.lax.fori_loop(0, tiles, open_slots, nothing)
-    total = saturating_sum(length)
+    begin, opened, used, least = jax.lax.fori_loop(0, tiles, open_slots, nothing)
+    total = jnp.where(least < 0, jnp.int32(2**31 - 1), used)
     # Tiles that are not taken leave zeros, but what is not listed begins at the end.
     begin = jnp.where(is_listed, begin[:count], total)
     return Slots(_sum_tiles(opened, total) - 1, begin, total)
