@@ -167,7 +167,7 @@ def block_memory(
     network: Network, limits: Limits, variables: Variables, encoded: image.Encoded
 ) -> int:
     """Scratch memory of one block of f_2D, the same for every image, in bytes."""
-    rows = blocks.BLOCK
+    rows = blocks.largest_block(lit=False)
     zeros = np.zeros((rows, 3), np.float32)
     queries = Oriented(zeros, zeros, np.ones(rows, bool))
     flat = only(limits, network.query.name)

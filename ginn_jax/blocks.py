@@ -15,9 +15,12 @@ from jaxtyping import Float
 
 from ginn_jax.dataset import relative_to
 from ginn_jax.neighbors import bucket, pad_rows
+from ginn_jax.process import on_cpu
 from ginn_jax.receptive_field import Oriented
 
 BLOCK = 1 << 15
+# A GPU has as many lanes as queries; what a block needs has to fit its memory.
+GPU_BLOCKS = 8
 
 _EACH = "device"
 Shared = TypeVar("Shared")
@@ -33,7 +36,7 @@ class Turn(NamedTuple):
 
 def largest_block(lit: bool) -> int:
     """Queries of a block: half as many where three colours share a core's cache."""
-    return BLOCK // 2 if lit else BLOCK
+    return BLOCK * (1 if on_cpu() else GPU_BLOCKS) // (2 if lit else 1)
 
 
 def block_size(points: int, lit: bool) -> int:
@@ -92,6 +95,21 @@ def channels_in_turns(
     padded = np.asarray(pad_channels(numbers, int(np.prod(shape))))
     split = padded.reshape(len(numbers), *shape, numbers.shape[2])
     return list(np.moveaxis(split, 0, 2))
+
+
+def make_turns(
+    lit: bool,
+    center: Float[np.ndarray, "3"] | None,
+    position: Float[np.ndarray, "M 3"],
+    normal: Float[np.ndarray, "M 3"],
+    material: Float[np.ndarray, "C M A"] | None = None,
+    light: Float[np.ndarray, "C M L"] | None = None,
+) -> list[Turn]:
+    """Points in turns of a block for every device, with what is asked of them."""
+    size = block_size(len(position), lit)
+    queries = in_turns(center, position, normal, size)
+    numbers = (channels_in_turns(a, size, len(queries)) for a in (material, light))
+    return list(map(Turn, queries, *numbers))
 
 
 def in_rows(turns: Sequence[Any]) -> Float[np.ndarray, "M *C"]:

@@ -16,12 +16,11 @@ from ginn_jax.architecture import Network
 from ginn_jax.blocks import (
     Turn,
     block_size,
-    channels_in_turns,
     everywhere,
     for_each_block,
     in_rows,
-    in_turns,
     largest_block,
+    make_turns,
     pad_channels,
     pad_points,
 )
@@ -187,7 +186,7 @@ def query_limits(
     return measure_limits(only(ample, network.query.name), probe, len(turns), SLACK)
 
 
-def _shade_turns(
+def shade_turns(
     network: Network,
     variables: Variables,
     encoded: Encoded,
@@ -195,7 +194,7 @@ def _shade_turns(
     coherent: bool,
     limits: Limits,
 ) -> tuple[list[Array], list[Demands]]:
-    """Values of the blocks of every turn, and their demands."""
+    """Values of the blocks of every turn, and their demands; may not be done yet."""
     needed = {"shader": variables["shader"]}, encoded._replace(center=None, kept=None)
     given = network, only(limits, network.query.name), coherent, *everywhere(needed)
     made = [shade_turn(*given, turn) for turn in turns]
@@ -227,15 +226,14 @@ def shade_points(
         numbers_of("material", material, network.materials, len(position))
         numbers_of("light", light, network.lights, len(position), least=0.0)
         channels_alike(encoded.scale, material, light)
-    size = block_size(len(position), encoded.scale is not None)
-    queries = in_turns(encoded.center, position, normal, size)
-    asked = numbers_asked(network, material, light)
-    numbers = (channels_in_turns(a, size, len(queries)) for a in asked)
-    turns = list(map(Turn, queries, *numbers))
-    attempt = partial(_shade_turns, network, variables, encoded, turns, coherent)
+    lit, asked = encoded.scale is not None, numbers_asked(network, material, light)
+    turns = make_turns(lit, encoded.center, position, normal, *asked)
+    attempt = partial(shade_turns, network, variables, encoded, turns, coherent)
+    queries = [turn.queries for turn in turns]
     measure = partial(query_limits, network, encoded.searched(), queries, coherent)
     parts, sufficed, demands = with_room(limits, attempt, measure)
-    if 2 * size > largest_block(encoded.scale is not None):  # the next may be larger
+    size = block_size(len(position), lit)
+    if 2 * size > largest_block(lit):  # the next may be larger
         sufficed = fitted(sufficed, demands)
     say_raised(limits, sufficed)
     warn_of_gaps(network.query, demands, len(position))

@@ -4,11 +4,17 @@ The same function in three layouts, because the layout decides the time on a CPU
 first, edges first, and edges first for gradients.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
+
+# A GPU would round the factors of a product to ten bits by default.
+EXACT = jax.lax.Precision.HIGHEST
+_product = partial(jnp.matmul, precision=EXACT)
+_einsum = partial(jnp.einsum, precision=EXACT)
 
 
 class Kernel(NamedTuple):
@@ -50,9 +56,9 @@ def evaluate_kernel(
     ) -> Float[Array, "K E"]:
         # XLA's products are fast on weights that lie turned, not on weights it turns.
         w1, w2, w3 = (jax.lax.optimization_barrier(w.T) for w in (w1, w2, w3))
-        hidden = jax.nn.relu(w1 @ inputs + b1[:, None])
-        hidden = jax.nn.relu(w2 @ hidden + b2[:, None])
-        return w3 @ hidden + b3[:, None]
+        hidden = jax.nn.relu(_product(w1, inputs) + b1[:, None])
+        hidden = jax.nn.relu(_product(w2, hidden) + b2[:, None])
+        return _product(w3, hidden) + b3[:, None]
 
     values = [block(*(a[i] for a in kernel)) for i in range(kernel.w1.shape[0])]
     return jnp.concatenate(values)[:outputs]
@@ -73,9 +79,9 @@ def edges_first_to_differentiate(
     def block(
         w1: Array, b1: Array, w2: Array, b2: Array, w3: Array, b3: Array
     ) -> Float[Array, "E K"]:
-        hidden = jax.nn.relu(jnp.einsum("ih,ie->he", w1, inputs) + b1[:, None])
-        hidden = jax.nn.relu(jnp.einsum("ih,ie->he", w2, hidden) + b2[:, None])
-        return jnp.einsum("hk,he->ek", w3, hidden) + b3
+        hidden = jax.nn.relu(_einsum("ih,ie->he", w1, inputs) + b1[:, None])
+        hidden = jax.nn.relu(_einsum("ih,ie->he", w2, hidden) + b2[:, None])
+        return _einsum("hk,he->ek", w3, hidden) + b3
 
     values = [block(*(a[i] for a in kernel)) for i in range(kernel.w1.shape[0])]
     return jnp.concatenate(values, axis=-1)[:, :outputs]

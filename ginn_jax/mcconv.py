@@ -25,7 +25,8 @@ from ginn_jax.kernels import (
     edges_first_to_differentiate,
     evaluate_kernel,
 )
-from ginn_jax.receptive_field import Field, tile_count, tile_size
+from ginn_jax.ranges import over_tiles
+from ginn_jax.receptive_field import Field, tile_size
 
 
 def mc_conv(
@@ -148,10 +149,12 @@ def _take_tile(field: Field, number: Int[Array, ""]) -> _Tile:
 
 def _over_tiles(field: Field, body: Any, start: Any) -> Any:
     """`body(tile, carry)` for every tile with real edges."""
-    tiles = tile_count(field.sender.shape[0], field.count)
-    return jax.lax.fori_loop(
-        0, tiles, lambda i, carry: body(_take_tile(field, i), carry), start
-    )
+    edges = field.sender.shape[0]
+
+    def take(number: Int[Array, ""], state: Any) -> Any:
+        return body(_take_tile(field, number), state)
+
+    return over_tiles(take, field.count, edges, tile_size(edges), start)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))

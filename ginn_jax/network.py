@@ -5,6 +5,7 @@ light; which layers there are is `architecture`'s table. 1x1 layers and norms ar
 linen's, convolutions are `mcconv`'s.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -13,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from ginn_jax.architecture import Conv, Network
 from ginn_jax.geometry import Geometry
-from ginn_jax.kernels import init_kernel
+from ginn_jax.kernels import EXACT, init_kernel
 from ginn_jax.mcconv import apply_stored, mc_conv, mc_conv_mixing, weighted_sum
 from ginn_jax.receptive_field import Field
 
@@ -23,6 +24,7 @@ LEAST_LIKENESS = 1e-3
 # The collection of kernel values that are at hand already, see `relight`.
 STORED = "stored"
 Variables = dict[str, Any]
+dense = partial(nn.Dense, precision=EXACT)
 
 
 class Norm(nn.Module):
@@ -79,8 +81,8 @@ class Gate(nn.Module):
         self, free: Float[Array, "N K"], light: Float[Array, "N V"]
     ) -> Float[Array, "N W"]:
         ones = nn.initializers.ones_init()
-        gate = nn.Dense(self.width, bias_init=ones, name="gate")(free)
-        return gate * nn.Dense(self.width, use_bias=False, name="light")(light)
+        gate = dense(self.width, bias_init=ones, name="gate")(free)
+        return gate * dense(self.width, use_bias=False, name="light")(light)
 
 
 class McConv(nn.Module):
@@ -99,7 +101,7 @@ class McConv(nn.Module):
         if conv.before in ("norm", "dense"):
             free = Norm(network.norm, self.train)(free, mask)
         if conv.before in ("dense", "lift"):
-            free = nn.Dense(conv.channels)(free)
+            free = dense(conv.channels)(free)
             free = Norm(network.norm, self.train)(free, mask)
             if light is not None:
                 light = Gate(network.beams or conv.channels)(free, light)
@@ -153,7 +155,7 @@ class Encoder(nn.Module):
         free = x.free
         if network.encoder:
             free = Norm(network.norm, self.train)(free, levels[0].mask)
-        free = nn.Dense(network.latent, name="latent")(free)
+        free = dense(network.latent, name="latent")(free)
         free = Norm(network.norm, self.train)(free, levels[0].mask)
         beams = []
         if x.light is not None:
@@ -196,9 +198,9 @@ class Shader(nn.Module):
     ) -> Float[Array, "M"]:
         network = self.network
         if network.splat:
-            free = nn.Dense(network.head)(code.free)
+            free = dense(network.head)(code.free)
             free = Norm(network.norm, self.train)(free, senders)
-            values = nn.Dense(1)(free)[:, 0]
+            values = dense(1)(free)[:, 0]
             if code.light is not None:
                 dimmed = Gate(network.head, name="out_light")(free, code.light)
                 values += jnp.sum(dimmed, axis=1)
@@ -207,11 +209,11 @@ class Shader(nn.Module):
         x = layer(code, senders, field, attributes.shape[0])
         seen, _ = enter(network, attributes, light)
         free = Norm(network.norm, self.train)(x.free, mask)
-        free = nn.Dense(network.head)(jnp.concatenate([free, seen], axis=1))
+        free = dense(network.head)(jnp.concatenate([free, seen], axis=1))
         free = Norm(network.norm, self.train)(free, mask)
         values = jnp.zeros(mask.shape)
         if not network.linear:
-            values = nn.Dense(1)(free)[:, 0]
+            values = dense(1)(free)[:, 0]
         if x.light is None:
             return values
         beams = [x.light] if light is None else [x.light, light]

@@ -88,6 +88,11 @@ def _end_after(parent: BaseProcess) -> None:
     os._exit(1)
 
 
+def on_cpu() -> bool:
+    """Whether what is compiled runs on cores with caches to fit, or all at once."""
+    return jax.default_backend() == "cpu"
+
+
 def available_cores() -> int:
     """Cores this process may use."""
     if hasattr(os, "sched_getaffinity"):

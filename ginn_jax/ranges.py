@@ -2,7 +2,7 @@
 
 Ranges of rows are expanded to one list by prefix sums, in a capacity that the caller
 chose. On CPU lists are made tile by tile, as many as hold real rows: capacity costs
-memory, not time, and a tile fits a core's cache. Elsewhere everything is one tile.
+memory, not time, and a tile fits a core's cache. On a GPU everything is one tile.
 """
 
 from collections.abc import Callable
@@ -12,13 +12,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from ginn_jax.process import on_cpu
+
 TILE = 1 << 13
 Made = TypeVar("Made")
 
 
 def tile_rows(capacity: int, most: int = TILE) -> int:
     """Rows of a tile: everything at once where there is no cache to fit."""
-    return min(most, capacity) if jax.default_backend() == "cpu" else capacity
+    return min(most, capacity) if on_cpu() else capacity
 
 
 def tiles_holding(rows: Int[Array, "*K"], size: int) -> Int[Array, "*K"]:
@@ -29,6 +31,24 @@ def tiles_holding(rows: Int[Array, "*K"], size: int) -> Int[Array, "*K"]:
     size = max(size, 1)
     whole = jax.lax.div(rows, jnp.int32(size))
     return whole + (rows > whole * size).astype(jnp.int32)
+
+
+def over_tiles(
+    body: Callable[[Int[Array, ""], Made], Made],
+    rows: Int[Array, ""],
+    capacity: int,
+    size: int,
+    state: Made,
+) -> Made:
+    """`body(tile, state)` for every tile of that size that holds some of the rows.
+
+    On a GPU the one tile that holds all is taken without asking how many there are: it
+    would wait for the host before every turn of a loop.
+    """
+    if 0 < capacity <= size and not on_cpu():
+        return body(jnp.int32(0), state)
+    tiles = tiles_holding(jnp.minimum(rows, capacity), size)
+    return jax.lax.fori_loop(0, tiles, body, state)
 
 
 def fill(
@@ -56,8 +76,7 @@ def fill(
             lambda a, b: jax.lax.dynamic_update_slice_in_dim(a, b, start, 0), made, some
         )
 
-    tiles = tiles_holding(jnp.minimum(count, capacity), size)
-    return jax.lax.fori_loop(0, tiles, add, zeros)
+    return over_tiles(add, count, capacity, size, zeros)
 
 
 def prefix_sum(counts: Int[Array, "K"]) -> Int[Array, "K"]:
@@ -123,8 +142,7 @@ def range_slots(
 
     zero = jnp.int32(0)
     nothing = jnp.zeros_like(padded), jnp.zeros(capacity, jnp.int32), zero, zero
-    tiles = tiles_holding(listed, size)
-    begin, opened, used, least = jax.lax.fori_loop(0, tiles, open_slots, nothing)
+    begin, opened, used, least = over_tiles(open_slots, listed, count, size, nothing)
     total = jnp.where(least < 0, jnp.int32(2**31 - 1), used)
     # Tiles that are not taken leave zeros, but what is not listed begins at the end.
     begin = jnp.where(is_listed, begin[:count], total)
@@ -143,9 +161,9 @@ def _sum_tiles(counts: Int[Array, "K"], count: Int[Array, ""]) -> Int[Array, "K"
         summed = jax.lax.dynamic_update_slice_in_dim(summed, some, tile * size, axis=0)
         return summed, some[-1]
 
-    tiles = tiles_holding(jnp.minimum(count, counts.shape[0]), size)
     nothing = jnp.zeros_like(padded), jnp.int32(0)
-    return jax.lax.fori_loop(0, tiles, add, nothing)[0][: counts.shape[0]]
+    summed, _ = over_tiles(add, count, counts.shape[0], size, nothing)
+    return summed[: counts.shape[0]]
 
 
 class Expansion(NamedTuple):

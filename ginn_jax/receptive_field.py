@@ -8,8 +8,8 @@ appendix; `mcconv` has the sum). No parameter enters it:
     surface  w_j = A_j / (pi r^2), where A_j is the area that sender j stands for, once
              for every sender: O(|N|), and unmoved by a change of sampling density
 
-Edges are taken in tiles that fit a core's cache, as many as hold real edges: padding
-costs memory, not time.
+On CPU edges are taken in tiles that fit a core's cache, as many as hold real edges:
+padding costs memory, not time.
 """
 
 from functools import partial
@@ -21,7 +21,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ginn_jax.hierarchy import squared_lengths
 from ginn_jax.packets import Edges
-from ginn_jax.ranges import expand_ranges, tiles_holding
+from ginn_jax.process import on_cpu
+from ginn_jax.ranges import expand_ranges, over_tiles
 from ginn_jax.voxels import morton_order
 
 TILE = 8192
@@ -60,15 +61,10 @@ def tile_size(edges: int) -> int:
     Tiles share the edges out evenly. Their size is an odd multiple of 16: of a power of
     two, all rows of a tile would compete for the same few lines of the cache.
     """
-    if jax.default_backend() != "cpu":
+    if not on_cpu():
         return edges
     tiles = -(-edges // TILE)
     return min(-(-edges // (16 * max(tiles, 1))) * 16 | 16, edges)
-
-
-def tile_count(edges: int, count: Int[Array, ""]) -> Int[Array, ""]:
-    """Tiles with real edges."""
-    return tiles_holding(jnp.minimum(count, edges), tile_size(edges))
 
 
 def input_count(oriented: bool) -> int:
@@ -141,7 +137,7 @@ def _inputs_in_tiles(
         return jax.lax.dynamic_update_slice_in_dim(inputs, some, start, axis=1)
 
     nothing = jnp.zeros((input_count(oriented), edges), senders.dtype)
-    return jax.lax.fori_loop(0, tile_count(edges, count), fill, nothing)
+    return over_tiles(fill, count, edges, size, nothing)
 
 
 def _inputs_forward(

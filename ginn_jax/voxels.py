@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
+from ginn_jax.process import on_cpu
 from ginn_jax.ranges import prefix_sum
 
 # Columns: at most as many as points, but for few points.
@@ -142,8 +143,14 @@ def narrow_runs(
     low: Int[Array, "*K"],
     high: Int[Array, "*K"],
 ) -> tuple[Int[Array, "*K"], Int[Array, "*K"]]:
-    """Binary search in rows first..last for those with low <= layer < high."""
-    steps = 32 - jax.lax.clz(jnp.max(last - first, initial=0))
+    """Binary search in rows first..last for those with low <= layer < high.
+
+    On CPU no more steps than these runs need, on a GPU as many as any may: it would
+    wait for the host to say how many.
+    """
+    steps = layer.shape[0].bit_length()
+    if on_cpu():
+        steps = 32 - jax.lax.clz(jnp.max(last - first, initial=0))
 
     def halve(
         _: Int[Array, ""], state: tuple[Int[Array, "*K"], ...]
