@@ -110,6 +110,11 @@ def in_open3d(layer: Layer, points: np.ndarray, radius: float) -> Callable[[], A
     return forward
 
 
+def on_host(result: Any) -> np.ndarray:
+    """What a peer made, which may be on a GPU."""
+    return np.asarray(result.cpu() if hasattr(result, "cpu") else result)
+
+
 def check(mine: Calls, theirs: Calls) -> float:
     """Largest difference relative to the largest value; AssertionError if too large."""
     worst = 0.0
@@ -117,7 +122,7 @@ def check(mine: Calls, theirs: Calls) -> float:
     pairs = [(mine["forward"](), theirs["forward"]())]
     pairs += zip([*(a[0] for a in kernel), features], theirs["gradient"](), strict=True)
     for a, b in pairs:
-        a, b = np.asarray(a), np.asarray(b)
+        a, b = np.asarray(a), on_host(b)
         worst = max(worst, float(np.abs(a - b).max() / np.abs(b).max()))
     if worst > TOLERANCE:
         raise AssertionError(f"PyTorch's results differ by {worst}")

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -156,10 +157,11 @@ def _in_torch(
     import torch  # pyright: ignore
 
     sender, receiver, inputs, weight = edges
-    weights = [torch.tensor(np.asarray(a[0])) for a in kernel]
-    x, given, seen = map(torch.tensor, (features, cotangent, inputs))
-    rows, ends = (torch.tensor(a.astype(np.int64)) for a in (sender, receiver))
-    share = torch.tensor(weight)[:, None]
+    there = partial(torch.tensor, device="cuda" if torch.cuda.is_available() else "cpu")
+    weights = [there(np.array(a[0])) for a in kernel]
+    x, given, seen = map(there, (features, cotangent, inputs))
+    rows, ends = (there(a.astype(np.int64)) for a in (sender, receiver))
+    share = there(weight)[:, None]
 
     def apply(weights: Any, x: Any) -> Any:
         w1, b1, w2, b2, w3, b3 = weights
@@ -169,13 +171,17 @@ def _in_torch(
 
     def forward() -> Any:
         with torch.no_grad():
-            return apply(weights, x)
+            return arrived(apply(weights, x))
 
     def gradient() -> Any:
         leaves = [a.clone().requires_grad_() for a in (*weights, x)]
-        return torch.autograd.grad(
-            (apply(leaves[:-1], leaves[-1]) * given).sum(), leaves
-        )
+        objective = (apply(leaves[:-1], leaves[-1]) * given).sum()
+        return arrived(torch.autograd.grad(objective, leaves))
+
+    def arrived(result: Any) -> Any:
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+        return result
 
     return {"forward": forward, "gradient": gradient}
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import tiny
 
-from benchmarks import generation
+from benchmarks import frame, generation
 from benchmarks import relight as relight_benchmark
 from experiments import gi_train, sss_train
 from ginn_jax import blocks, evaluate, evaluate_light, presets, scenes, train
@@ -240,7 +240,7 @@ def test_grey_light_on_grey_things_is_one_channel():
     assert evaluate_light.distinct_channels(numbers, coloured)[1].shape[0] == 3
 
 
-def test_relight_benchmark(tmp_path, monkeypatch):
+def test_relight_and_frame_benchmarks(tmp_path, monkeypatch):
     options = relight_benchmark.Options(
         out=tmp_path, resolution=24, points=1000, repeats=1, networks=("ao",)
     )
@@ -256,8 +256,19 @@ def test_relight_benchmark(tmp_path, monkeypatch):
         trained = config, tiny.ONE_LEVEL_LIMITS, weights
         monkeypatch.setattr(relight_benchmark, "load_any", lambda name: trained)
         metrics = relight_benchmark.main(options)
-    [row] = metrics["rows"]
-    assert row["largest_difference"] < 1e-3
+        [row] = metrics["rows"]
+        assert row["largest_difference"] < 1e-3
+        monkeypatch.setattr(frame, "load_any", lambda name: trained)
+        more = frame.Options(tmp_path, ("gi",), resolution=24, points=1000, repeats=1)
+        [case] = frame.main(more)["cases"]
+        made = frame.make_frame(more, network, "gi")
+        calls = frame.calls_of(network, trained[1], weights, made)
+        values, _ = calls["f_2D, programs"]()
+        seen = calls["f_2D"]()[made.gbuffer.mask]
+    assert case["pixels"] == len(seen)
+    # The same pixels in an order of their own; what is below zero shows as black.
+    alone = np.maximum(blocks.in_rows(values)[: len(seen)], 0.0)
+    np.testing.assert_allclose(np.sort(alone, 0), np.sort(seen, 0), atol=1e-5)
 
 
 def test_generation_benchmark(tmp_path):
