@@ -1,13 +1,14 @@
 """Networks that train for the same time, and how long one of their steps takes."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import jax
 import numpy as np
 import tiny
 
-from benchmarks import networks
+from benchmarks import departures, networks
 from ginn_jax import blocks, scenes
+from ginn_jax.presets import PAPER
 from ginn_jax.room import Room
 from ginn_jax.searches import uniform_limits
 
@@ -62,3 +63,35 @@ def test_step_is_timed_once_it_is_compiled_and_has_room(monkeypatch):
     # The fourth and the fifth; begun at 4 and 6 (or so), over at 5 and 7.
     assert networks.step_seconds(None, []) == ((4**2 - 3**2) + (6**2 - 5**2)) / 2
     assert next(found, "none left") == "none left"
+
+
+def test_every_departure_is_left_out_alone_and_all_at_once():
+    ours, *_, bare = departures.variants(departures.DEFAULT).values()
+
+    def changes(network):
+        pairs = ((f.name, getattr(network, f.name)) for f in fields(network))
+        return {name for name, value in pairs if value != getattr(ours, name)}
+
+    found = departures.variants(ours).items()
+    changed = {name: changes(network) for name, network in found}
+    for name, change in departures.WITHOUT.items():
+        assert changed[f"without {name}"] == set(change)
+    assert changed["without any"] == set().union(*departures.WITHOUT.values())
+    same = "oriented", "density", "norm", "sided", "taper"
+    assert [getattr(bare, n) for n in same] == [getattr(PAPER, n) for n in same]
+
+
+def test_departures(tmp_path, monkeypatch):
+    network, limits = tiny.ONE_LEVEL, tiny.ONE_LEVEL_LIMITS
+    monkeypatch.setattr(departures, "variants", lambda _: {"ours": network})
+    monkeypatch.setattr("ginn_jax.fit.training_room", lambda *_: Room(limits, limits))
+    monkeypatch.setattr(blocks, "BLOCK", 128)
+    monkeypatch.setattr(scenes, "ProcessPoolExecutor", tiny.Here)
+    options = departures.Options(
+        tmp_path, steps=2, shapes=2, test_shapes=1, points=1000, rays=4, resolution=32
+    )
+    with tiny.cheap_compiling(), jax.numpy_dtype_promotion("standard"):
+        [row] = departures.main(options)["rows"]
+    assert np.isfinite(row["relative, shapes"])
+    assert row["step_ms"] > 0
+    assert "ours" in (tmp_path / "report.md").read_text()

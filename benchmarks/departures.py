@@ -1,0 +1,195 @@
+"""What each departure from the paper brings: networks of occlusion that lack one.
+
+    python -m benchmarks.departures
+
+All train for as many steps on the same clouds and are asked about the same unseen
+objects: ours, ours from other random weights (how far chance goes), ours without one
+departure at a time, and without any: the paper's convolution in our table of layers.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+from rich.console import Console
+
+from benchmarks.timing import circumstances, describe
+from ginn_jax import evaluate, experiment, objects, report, scenes
+from ginn_jax.architecture import Network
+from ginn_jax.commandline import require, start
+from ginn_jax.dataset import ShadedPoints
+from ginn_jax.limits import Limits
+from ginn_jax.mesh import find_meshes
+from ginn_jax.presets import DEFAULT
+from ginn_jax.recipe import Training
+
+EXACT_RAYS = 1024
+
+
+@dataclass(frozen=True)
+class Options:
+    """Train networks that lack a departure and compare their errors and times."""
+
+    out: Path = Path("runs/departures")
+    """Folder for clouds, runs, metrics.json and report.md."""
+    steps: int = 800
+    """Steps of training of each."""
+    shapes: int = 200
+    """Procedural shapes to train on."""
+    test_shapes: int = 12
+    """Unseen shapes to evaluate on."""
+    test_meshes: Path | None = None
+    """A mesh file or a folder of meshes to evaluate on as well."""
+    points: int = 32_000
+    """Samples per object."""
+    rays: int = 64
+    """Rays per training point."""
+    resolution: int = 512
+    """Side of the image that is timed, in pixels."""
+    seed: int = 0
+    """Seed of everything."""
+    quick: bool = False
+    """One step on little data: to try things, not for numbers."""
+
+
+QUICK = {"steps": 1, "shapes": 2, "test_shapes": 1, "points": 2000, "rays": 2}
+QUICK |= {"resolution": 48}
+
+# What the paper has in the place of each departure.
+WITHOUT: dict[str, dict[str, Any]] = {
+    "normals in kernels": {"oriented": False},
+    "weights by area": {"density": "kde"},
+    "sides": {"sided": False},
+    "fading borders": {"taper": 0.0},
+    "layer norms": {"norm": "batch"},
+}
+
+
+class Unseen(NamedTuple):
+    """Objects of one kind that no network trained on, and their clouds."""
+
+    sources: Sequence[objects.Source]
+    clouds: list[ShadedPoints]
+
+
+def variants(network: Network) -> dict[str, Network]:
+    """Ours, the same for other weights, and what lacks one departure or all."""
+    lacking = {f"without {n}": replace(network, **c) for n, c in WITHOUT.items()}
+    paper = {
+        key: value for changes in WITHOUT.values() for key, value in changes.items()
+    }
+    ours = {"ours": network, "ours, other weights": network}
+    return ours | lacking | {"without any": replace(network, **paper)}
+
+
+def compare(
+    console: Console,
+    options: Options,
+    config: Training,
+    clouds: list[ShadedPoints],
+    tests: dict[str, Unseen],
+    folder: Path,
+) -> dict[str, Any]:
+    """Errors and times of one network after its training."""
+    run = experiment.RunOptions(out=folder, steps=options.steps)
+    done = experiment.train(console, config, clouds, run, {})
+    variables = jax.device_put(done.state.variables, jax.devices()[0])
+    model = evaluate.Model(variables, jax.random.key(options.seed))
+    network, seconds = config.network, done.seconds["train"]
+    row: dict[str, Any] = {"step_ms": 1e3 * seconds / options.steps}
+    row |= {"skipped": int(done.state.skipped)}
+    limits = done.limits
+    for name, unseen in tests.items():
+        called = [source.name for source in unseen.sources]
+        given = network, limits, model, unseen.clouds, called, EXACT_RAYS
+        rows, limits = evaluate.evaluate_clouds(*given)
+        row[f"relative, {name}"] = evaluate.pool_rows(rows)["relative_mse_3d"]
+    return row | image_times(options, network, limits, model, tests["shapes"])
+
+
+def image_times(
+    options: Options,
+    network: Network,
+    limits: Limits,
+    model: evaluate.Model,
+    unseen: Unseen,
+) -> dict[str, float]:
+    """Milliseconds of an image of the first unseen object."""
+    mesh = objects.load_object(unseen.sources[0])
+    view = evaluate.reference_view(mesh, 0.1, 4, options.seed, options.resolution)
+    cloud = evaluate.split_cloud(unseen.clouds[0])[0]
+    found = evaluate.network_row(network, limits, model, cloud, view)[0]
+    return {f"{part}_ms": 1e3 * found[f"seconds_{part}"] for part in ("3d", "2d")}
+
+
+def make_clouds(
+    console: Console, options: Options
+) -> tuple[list[ShadedPoints], dict[str, Unseen]]:
+    """Clouds to train on and unseen ones."""
+    settings = scenes.Occlusion(options.points, options.rays)
+    exact = scenes.Occlusion(options.points, EXACT_RAYS)
+    seen = objects.procedural_sources(options.shapes, options.seed)
+    kinds = {
+        "shapes": objects.procedural_sources(options.test_shapes, objects.UNSEEN_SEED)
+    }
+    if options.test_meshes is not None:
+        kinds["meshes"] = objects.file_sources(find_meshes(options.test_meshes))
+    folder = options.out / "data"
+    clouds = experiment.make(console, "training", seen, settings, folder / "training")
+    return clouds, {
+        name: Unseen(some, experiment.make(console, name, some, exact, folder / name))
+        for name, some in kinds.items()
+    }
+
+
+def main(options: Options) -> dict[str, Any]:
+    """Train and evaluate every variant; returns what metrics.json holds."""
+    least = {"steps": 1, "shapes": 1, "test_shapes": 1, "points": 1000, "rays": 2}
+    require(options, least | {"resolution": 32, "seed": 0})
+    console, begin = Console(), time.perf_counter()
+    clouds, tests = make_clouds(console, options)
+    rows = []
+    for name, network in variants(DEFAULT).items():
+        console.print(name)
+        folder = options.out / name.replace(" ", "_").replace(",", "")
+        run = experiment.RunOptions(steps=options.steps, seed=options.seed)
+        config = experiment.training(run, network, options.points, len(clouds))
+        if name == "ours, other weights":
+            config = replace(config, seed=options.seed + 1)
+        found = compare(console, options, config, clouds, tests, folder)
+        rows.append({"network": name} | found)
+    metrics = {"rows": rows} | circumstances(options, begin)
+    text = write_report(options, rows)
+    report.write_results(options.out, metrics, text)
+    print(text)
+    return metrics
+
+
+def write_report(options: Options, rows: list[dict[str, Any]]) -> str:
+    """report.md: a row for each network."""
+    errors = [name for name in rows[0] if name.startswith("relative, ")]
+    heads = {"network": "network"}
+    heads |= {name: f"relative 3D MSE, {name[10:]}" for name in errors}
+    heads |= {"step_ms": "train step, ms", "3d_ms": "f_3D, ms", "2d_ms": "f_2D, ms"}
+    changes = "; ".join(
+        f"{name}: {', '.join(f'{k} = {v}' for k, v in change.items())}"
+        for name, change in WITHOUT.items()
+    )
+    return f"""# Departures from the paper, ambient occlusion
+
+{options.steps} steps each on {options.shapes} shapes of {options.points} points at
+{options.rays} rays, batches of two; one run each, so that differences as small as that
+between the two rows of ours may be chance. Errors are those of unseen objects, noise
+subtracted; times those of an image of {options.resolution} x {options.resolution}; of
+training, compilation apart. Without what: {changes}.
+
+{describe()}
+
+{report.table_of(rows, heads)}"""
+
+
+if __name__ == "__main__":
+    start(Options, main, QUICK)
