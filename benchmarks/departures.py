@@ -3,8 +3,9 @@
     python -m benchmarks.departures
 
 All train for as many steps on the same clouds and are asked about the same unseen
-objects: ours, ours from other random weights (how far chance goes), ours without one
-departure at a time, and without any: the paper's convolution in our table of layers.
+objects: ours, ours from other random weights (how far chance goes), ours without any
+departure, which is the paper's convolution in our table of layers, and without one at a
+time.
 """
 
 import time
@@ -25,6 +26,7 @@ from ginn_jax.limits import Limits
 from ginn_jax.mesh import find_meshes
 from ginn_jax.presets import DEFAULT
 from ginn_jax.recipe import Training
+from ginn_jax.run_record import RECORD
 
 EXACT_RAYS = 1024
 
@@ -51,6 +53,8 @@ class Options:
     """Side of the image that is timed, in pixels."""
     seed: int = 0
     """Seed of everything."""
+    resume: bool = False
+    """Go on where a killed run with the same options was."""
     quick: bool = False
     """One step on little data: to try things, not for numbers."""
 
@@ -82,7 +86,7 @@ def variants(network: Network) -> dict[str, Network]:
         key: value for changes in WITHOUT.values() for key, value in changes.items()
     }
     ours = {"ours": network, "ours, other weights": network}
-    return ours | lacking | {"without any": replace(network, **paper)}
+    return ours | {"without any": replace(network, **paper)} | lacking
 
 
 def compare(
@@ -94,7 +98,8 @@ def compare(
     folder: Path,
 ) -> dict[str, Any]:
     """Errors and times of one network after its training."""
-    run = experiment.RunOptions(out=folder, steps=options.steps)
+    begun = options.resume and (folder / RECORD).exists()
+    run = experiment.RunOptions(out=folder, steps=options.steps, resume=begun)
     done = experiment.train(console, config, clouds, run, {})
     variables = jax.device_put(done.state.variables, jax.devices()[0])
     model = evaluate.Model(variables, jax.random.key(options.seed))
@@ -151,7 +156,7 @@ def main(options: Options) -> dict[str, Any]:
     require(options, least | {"resolution": 32, "seed": 0})
     console, begin = Console(), time.perf_counter()
     clouds, tests = make_clouds(console, options)
-    rows = []
+    rows, metrics = list[dict[str, Any]](), dict[str, Any]()
     for name, network in variants(DEFAULT).items():
         console.print(name)
         folder = options.out / name.replace(" ", "_").replace(",", "")
@@ -161,10 +166,10 @@ def main(options: Options) -> dict[str, Any]:
             config = replace(config, seed=options.seed + 1)
         found = compare(console, options, config, clouds, tests, folder)
         rows.append({"network": name} | found)
-    metrics = {"rows": rows} | circumstances(options, begin)
-    text = write_report(options, rows)
-    report.write_results(options.out, metrics, text)
-    print(text)
+        # After each, so that what was measured is not lost with what was not.
+        metrics = {"rows": rows} | circumstances(options, begin)
+        report.write_results(options.out, metrics, write_report(options, rows))
+    print(write_report(options, rows))
     return metrics
 
 

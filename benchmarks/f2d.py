@@ -29,6 +29,7 @@ from ginn_jax.limits import Limits, only
 from ginn_jax.mesh import find_meshes
 from ginn_jax.network import Variables
 from ginn_jax.presets import compact_network
+from ginn_jax.process import on_cpu
 from ginn_jax.receptive_field import Oriented
 from ginn_jax.recipe import Training
 from ginn_jax.reference import GBuffer, Scene
@@ -173,7 +174,7 @@ def block_memory(
     flat = only(limits, network.query.name)
     turn = blocks.turn_shapes(blocks.Turn(queries))
     shared = blocks.everywhere((variables, encoded))
-    lowered = inference.shade_turn.lower(network, flat, True, *shared, turn)
+    lowered = inference.shade_turn.lower(network, flat, on_cpu(), *shared, turn)
     memory = lowered.compile().memory_analysis()
     return int(memory.temp_size_in_bytes) if memory else 0
 

@@ -115,7 +115,7 @@ class Options:
 
 QUICK = {"objects": 1, "views": 1, "resolution": 64, "reference": 16, "points": 4000}
 QUICK |= {"counts": (1, 4), "disks": (), "scales": (0.5,), "draws": 2}
-QUICK |= {"fewer_looks": (32,)}
+QUICK |= {"shares": (), "fewer_looks": (32,)}
 
 
 def main(options: Options) -> dict[str, Any]:

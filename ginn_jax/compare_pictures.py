@@ -26,7 +26,7 @@ from ginn_jax.limits import only, without
 from ginn_jax.lit_clouds import Cloud, LitCloud, mean_light, points_of, split_points
 from ginn_jax.neighbors import bucket
 from ginn_jax.objects import Source
-from ginn_jax.process import spare_memory_maps
+from ginn_jax.process import on_cpu, spare_memory_maps
 from ginn_jax.receptive_field import Oriented
 from ginn_jax.scenes import Occlusion, Settings
 
@@ -177,7 +177,7 @@ def network_memory(trained: Trained, points: int) -> float:
     compiled = encode_whole.lower(*deep, *given).compile()
     encoded, _ = jax.eval_shape(partial(encode_whole, *deep), *given)
     kept = sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(encoded.code))
-    flat = network, only(limits, network.query.name), True, model.variables
+    flat = network, only(limits, network.query.name), on_cpu(), model.variables
     rows = largest_block(encoded.scale is not None)
     turn = turn_shapes(Turn(*shapes(rows, network.asks == "all")))
     shaded = shade_turn.lower(*flat, encoded, turn).compile()
