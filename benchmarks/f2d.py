@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.straightforward import shade_plainly
-from benchmarks.timing import Timing, circumstances, describe, measure
+from benchmarks.timing import Timing, describe, measure, write_cases
 from ginn_jax import blocks, image, inference, objects, reference, report
 from ginn_jax.architecture import Network
 from ginn_jax.camera import orbit_camera
@@ -189,13 +189,7 @@ def main(options: Options) -> dict[str, Any]:
     scene, gbuffer = make_frame(options)
     pairs = zip(options.disks, options.radii, strict=True)
     cases = [compare(options, disk, r, scene, gbuffer) for disk, r in pairs]
-    text = write_report(options, cases)
-    for case in cases:
-        case["timings"] = {n: t.record() for n, t in case["timings"].items()}
-    metrics = {"cases": cases} | circumstances(options, begin)
-    report.write_results(options.out, metrics, text)
-    print(text)
-    return metrics
+    return write_cases(options, cases, write_report(options, cases), begin)
 
 
 def write_report(options: Options, cases: list[dict[str, Any]]) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks.paper_tables import PAPER_MS
 from benchmarks.relight import in_random_light
-from benchmarks.timing import circumstances, describe, measure
+from benchmarks.timing import describe, measure, write_cases
 from ginn_jax import inference, objects, reference, report
 from ginn_jax.architecture import Network
 from ginn_jax.blocks import each_its_own, everywhere, make_turns
@@ -169,13 +169,7 @@ def main(options: Options) -> dict[str, Any]:
     require_some(options, "networks")
     begin = time.perf_counter()
     cases = [compare(options, name) for name in options.networks]
-    text = write_report(options, cases)
-    for case in cases:
-        case["timings"] = {n: t.record() for n, t in case["timings"].items()}
-    metrics = {"cases": cases} | circumstances(options, begin)
-    report.write_results(options.out, metrics, text)
-    print(text)
-    return metrics
+    return write_cases(options, cases, write_report(options, cases), begin)
 
 
 def write_report(options: Options, cases: list[dict[str, Any]]) -> str:

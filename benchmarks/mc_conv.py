@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks.mc_conv_peers import INPUTS, PEERS, Calls, Layer, make_layer
 from benchmarks.neighbors import surface, uniform
-from benchmarks.timing import circumstances, describe, measure
+from benchmarks.timing import describe, measure, write_cases
 from ginn_jax import report
 from ginn_jax.blocks import each_its_own, everywhere, for_each_block
 from ginn_jax.commandline import require, require_positive, require_some, start
@@ -164,13 +164,7 @@ def main(options: Options) -> dict[str, Any]:
     cases = [
         compare(options, c, r) for r in options.radii for c in ("uniform", "surface")
     ]
-    text = write_report(options, cases)
-    for case in cases:
-        case["timings"] = {n: t.record() for n, t in case["timings"].items()}
-    metrics = {"cases": cases} | circumstances(options, begin)
-    report.write_results(options.out, metrics, text)
-    print(text)
-    return metrics
+    return write_cases(options, cases, write_report(options, cases), begin)
 
 
 def write_report(options: Options, cases: list[dict[str, Any]]) -> str:

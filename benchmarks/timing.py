@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from ginn_jax.report import environment
+from ginn_jax.report import environment, write_results
 
 WARM = 0.2  # seconds
 Variants = Mapping[str, Callable[[], Any]]
@@ -91,6 +91,20 @@ def circumstances(options: Any, begin: float) -> dict[str, Any]:
         "machine": describe(),
         "seconds_total": time.perf_counter() - begin,
     }
+
+
+def write_cases(
+    options: Any, cases: list[dict[str, Any]], text: str, begin: float
+) -> dict[str, Any]:
+    """Write and print the report; metrics.json, returned, has the cases' timings."""
+    timed = [
+        case | {"timings": {n: t.record() for n, t in case["timings"].items()}}
+        for case in cases
+    ]
+    metrics = {"cases": timed} | circumstances(options, begin)
+    write_results(options.out, metrics, text)
+    print(text)
+    return metrics
 
 
 def describe() -> str:
