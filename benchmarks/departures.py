@@ -25,10 +25,10 @@ from ginn_jax.dataset import ShadedPoints
 from ginn_jax.limits import Limits
 from ginn_jax.mesh import find_meshes
 from ginn_jax.presets import DEFAULT
-from ginn_jax.recipe import Training
 from ginn_jax.run_record import RECORD
 
 EXACT_RAYS = 1024
+OTHER = "ours, other weights"
 
 
 @dataclass(frozen=True)
@@ -85,25 +85,32 @@ def variants(network: Network) -> dict[str, Network]:
     paper = {
         key: value for changes in WITHOUT.values() for key, value in changes.items()
     }
-    ours = {"ours": network, "ours, other weights": network}
+    ours = {"ours": network, OTHER: network}
     return ours | {"without any": replace(network, **paper)} | lacking
+
+
+def run_of(options: Options, name: str) -> experiment.RunOptions:
+    """What trains one variant, in a folder of its own."""
+    folder = options.out / name.replace(" ", "_").replace(",", "")
+    begun = options.resume and (folder / RECORD).exists()
+    seed = options.seed + (name == OTHER)
+    return experiment.RunOptions(folder, steps=options.steps, seed=seed, resume=begun)
 
 
 def compare(
     console: Console,
     options: Options,
-    config: Training,
+    run: experiment.RunOptions,
+    network: Network,
     clouds: list[ShadedPoints],
     tests: dict[str, Unseen],
-    folder: Path,
 ) -> dict[str, Any]:
     """Errors and times of one network after its training."""
-    begun = options.resume and (folder / RECORD).exists()
-    run = experiment.RunOptions(out=folder, steps=options.steps, resume=begun)
+    config = experiment.training(run, network, options.points, len(clouds))
     done = experiment.train(console, config, clouds, run, {})
     variables = jax.device_put(done.state.variables, jax.devices()[0])
     model = evaluate.Model(variables, jax.random.key(options.seed))
-    network, seconds = config.network, done.seconds["train"]
+    seconds = done.seconds["train"]
     row: dict[str, Any] = {"step_ms": 1e3 * seconds / options.steps}
     row |= {"skipped": int(done.state.skipped)}
     limits = done.limits
@@ -159,12 +166,8 @@ def main(options: Options) -> dict[str, Any]:
     rows, metrics = list[dict[str, Any]](), dict[str, Any]()
     for name, network in variants(DEFAULT).items():
         console.print(name)
-        folder = options.out / name.replace(" ", "_").replace(",", "")
-        run = experiment.RunOptions(steps=options.steps, seed=options.seed)
-        config = experiment.training(run, network, options.points, len(clouds))
-        if name == "ours, other weights":
-            config = replace(config, seed=options.seed + 1)
-        found = compare(console, options, config, clouds, tests, folder)
+        run = run_of(options, name)
+        found = compare(console, options, run, network, clouds, tests)
         rows.append({"network": name} | found)
         # After each, so that what was measured is not lost with what was not.
         metrics = {"rows": rows} | circumstances(options, begin)

@@ -17,12 +17,11 @@ import jax
 import numpy as np
 
 from benchmarks.paper_tables import PAPER_MS
-from benchmarks.relight import in_random_light
+from benchmarks.relight import lit_pair, sampled_and_seen
 from benchmarks.timing import describe, measure, write_cases
-from ginn_jax import inference, objects, reference, report
+from ginn_jax import inference, report
 from ginn_jax.architecture import Network
 from ginn_jax.blocks import each_its_own, everywhere, make_turns
-from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, require_some, start
 from ginn_jax.compare import SAMPLES
 from ginn_jax.errors import InputError
@@ -37,7 +36,7 @@ from ginn_jax.pretrained import load_any
 from ginn_jax.reference import GBuffer
 from ginn_jax.samples import Samples
 from ginn_jax.shading import Encoded
-from ginn_jax.visible import visible_samples
+from ginn_jax.upsample import Surface
 
 
 @dataclass(frozen=True)
@@ -72,23 +71,15 @@ class Frame(NamedTuple):
 
 def make_frame(options: Options, network: Network, effect: str) -> Frame:
     """An object on its ground, or alone where it scatters, in random light."""
-    scatters, lit = network.materials == 3, network.lights > 0
-    source = objects.procedural_sources(1, objects.BENCHMARK_SEED)[0]
-    scene = reference.build_scene(objects.load_object(source, ground=not scatters))
-    size = options.resolution
-    seen = reference.render_gbuffer(scene, orbit_camera(35.0, width=size, height=size))
     points = options.points or SAMPLES[effect]
-    cloud = visible_samples(scene, points, 0, not scatters)
-    if not lit:
+    cloud, seen = sampled_and_seen(network, points, options.resolution)
+    if not network.lights:
         return Frame(cloud, seen, (None, None), (None, None))
-    medium = np.array([10.0, 1.3]) if scatters else np.zeros(0)
-    there = (a[seen.mask] for a in (seen.position, seen.normal, seen.material))
-    pixels = in_random_light(Samples(*there), medium, 1)
+    numbers, of_pixels = map(network_numbers, lit_pair(network, cloud, seen))
     images = (
         np.stack([fill(seen.mask, channel) for channel in number])
-        for number in network_numbers(pixels)
+        for number in of_pixels
     )
-    numbers = network_numbers(in_random_light(cloud, medium, 0))
     return Frame(cloud, seen, numbers, tuple(images))
 
 
@@ -128,15 +119,10 @@ def programs(
 ) -> Callable[[], Any]:
     """f_2D with all that it needs on the devices, and its results left there."""
     seen = frame.gbuffer
-    near = network, encoded.center, seen.position, seen.mask
-    rows, coherent = pixels_in_order(*near)
-    ends = (a.reshape(-1, 3)[rows] for a in (seen.position, seen.normal))
-    numbers = (
-        a if a is None else a.reshape(len(a), seen.mask.size, -1)[:, rows]
-        for a in numbers_asked(network, *frame.of_pixels)
-    )
-    lit = encoded.scale is not None
-    turns = make_turns(lit, encoded.center, *ends, *numbers)
+    surface = Surface(seen.position, seen.normal, seen.mask)
+    numbers = numbers_asked(network, *frame.of_pixels)
+    _, pixels, coherent = pixels_in_order(network, encoded.center, surface, numbers)
+    turns = make_turns(encoded.scale is not None, encoded.center, *pixels)
     turns = [each_its_own(turn) for turn in turns]
     given = network, everywhere(variables), encoded, turns, coherent, limits
     return partial(inference.shade_turns, *given)

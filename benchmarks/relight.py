@@ -26,6 +26,7 @@ from ginn_jax.evaluate_light import encode_lit
 from ginn_jax.limits import Limits
 from ginn_jax.lit_clouds import LitCloud, network_numbers
 from ginn_jax.pretrained import load_any
+from ginn_jax.reference import GBuffer
 from ginn_jax.relight import prepare_relighting, relight
 from ginn_jax.samples import Samples
 from ginn_jax.visible import visible_samples
@@ -52,18 +53,30 @@ class Options:
 QUICK = {"resolution": 64, "points": 4000, "repeats": 2, "networks": ("gi",)}
 
 
-def lit_pair(options: Options, network: Network) -> tuple[LitCloud, LitCloud]:
-    """A cloud and the foreground pixels of a frame, in random light."""
-    scatters = network.materials == 3
+def sampled_and_seen(
+    network: Network, points: int, size: int
+) -> tuple[Samples, GBuffer]:
+    """An object, on its ground but where it scatters: samples of it, and a frame."""
+    ground = not scatters(network)
     source = objects.procedural_sources(1, objects.BENCHMARK_SEED)[0]
-    scene = reference.build_scene(objects.load_object(source, ground=not scatters))
-    size = options.resolution
+    scene = reference.build_scene(objects.load_object(source, ground=ground))
     seen = reference.render_gbuffer(scene, orbit_camera(width=size, height=size))
-    cloud = visible_samples(scene, options.points, 0, not scatters)
+    return visible_samples(scene, points, 0, ground), seen
+
+
+def scatters(network: Network) -> bool:
+    """Whether the network is one of subsurface scattering."""
+    return network.materials == 3
+
+
+def lit_pair(
+    network: Network, cloud: Samples, seen: GBuffer
+) -> tuple[LitCloud, LitCloud]:
+    """A cloud and the foreground pixels of a frame, in random light."""
     pixels = Samples(
         *(a[seen.mask] for a in (seen.position, seen.normal, seen.material))
     )
-    medium = np.array([10.0, 1.3]) if scatters else np.zeros(0)
+    medium = np.array([10.0, 1.3]) if scatters(network) else np.zeros(0)
     return in_random_light(cloud, medium, 0), in_random_light(pixels, medium, 1)
 
 
@@ -82,7 +95,8 @@ def compare(options: Options, name: str) -> dict[str, Any]:
     network = config.network
     if not network.lights:
         raise InputError(f"{name} takes no light: name one of gi or of sss")
-    cloud, pixels = lit_pair(options, network)
+    made = sampled_and_seen(network, options.points, options.resolution)
+    cloud, pixels = lit_pair(network, *made)
     model = Model(variables, jax.random.key(0))
     scratch, limits = from_scratch(network, limits, model, cloud, pixels)
     grey = [

@@ -13,14 +13,13 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ginn_jax.errors import InputError
 from ginn_jax.files import writing
+from ginn_jax.neighbors import offsets_from
 from ginn_jax.receptive_field import Oriented
 
 # Clouds of a batch stand this far apart, or this many times as far as any point lies
 # from the middle of its own: more than both extents and, for all but the smallest
 # clouds, the largest radius of a preset beside.
 SPACING, APART = 4.0, 3.0
-# Points that are counted from elsewhere at a time.
-RUN = 1 << 12
 
 
 class ShadedPoints(NamedTuple):
@@ -163,15 +162,7 @@ def relative_to(
     position = np.asarray(position)
     if center is None or (position.dtype == np.float32 and not np.any(center)):
         return np.asarray(position, np.float32)
-    flat = position.reshape(-1)
-    # NumPy is slow where it has to repeat three numbers.
-    middle = np.tile(np.asarray(center, np.float64), min(len(flat) // 3, RUN))
-    near = np.empty(flat.shape, np.float32)
-    for first in range(0, len(flat), 3 * RUN):
-        part = flat[first : first + 3 * RUN]
-        kept = near[first : first + 3 * RUN]
-        np.subtract(part, middle[: len(part)], out=kept, casting="same_kind")
-    return near.reshape(position.shape)
+    return offsets_from(center, position)
 
 
 def unit_light(

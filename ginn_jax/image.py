@@ -71,17 +71,27 @@ def coherent_pixels(
 def pixels_in_order(
     network: Network,
     center: Float[Any, "3"] | None,
-    position: Float[np.ndarray, "H W 3"],
-    mask: Bool[np.ndarray, "H W"],
-) -> tuple[Int[np.ndarray, "M"], bool]:
-    """The pixels in `mask` as f_2D takes them, and whether neighbours come together.
+    surface: Surface,
+    numbers: tuple[Float[np.ndarray, "C H W _"] | None, ...],
+) -> tuple[Int[np.ndarray, "M"], tuple[Any, ...], bool]:
+    """The pixels in the mask in the order that f_2D takes them in, their position,
+    normal and `numbers` (material and light), and whether neighbours come together.
 
     A GPU sorts them in less time than they take to get there.
     """
-    if not on_cpu():
-        return np.flatnonzero(mask), False
-    cell = COARSE * network.query.radius
-    return coherent_pixels(position, mask, cell, center), True
+    position, normal, mask = surface
+    if coherent := on_cpu():
+        cell = COARSE * network.query.radius
+        rows = coherent_pixels(position, mask, cell, center)
+    else:
+        rows = np.flatnonzero(mask)
+    # `take` is three times as fast here as an index.
+    ends = (np.reshape(a, (-1, 3)).take(rows, axis=0) for a in (position, normal))
+    numbers = tuple(
+        a if a is None else np.reshape(a, (len(a), mask.size, -1)).take(rows, 1)
+        for a in numbers
+    )
+    return rows, (*ends, *numbers), coherent
 
 
 def shade_image(
@@ -143,18 +153,11 @@ def _shade_pixels(
     numbers: tuple[Float[np.ndarray, "C H W _"] | None, ...],
 ) -> tuple[Float[np.ndarray, "H W *C"], Limits]:
     """Values of the pixels in the mask; `numbers`: material and light."""
-    position, normal, mask = surface
-    rows, coherent = pixels_in_order(network, encoded.center, position, mask)
-    # `take` is three times as fast here as an index.
-    position, normal = (
-        np.reshape(a, (-1, 3)).take(rows, axis=0) for a in (position, normal)
-    )
-    material, light = (
-        a if a is None else np.reshape(a, (len(a), mask.size, -1)).take(rows, 1)
-        for a in numbers
-    )
-    given = encoded, position, normal, material, light, coherent
+    ends = network, encoded.center, surface, numbers
+    rows, pixels, coherent = pixels_in_order(*ends)
+    given: tuple[Any, ...] = encoded, *pixels, coherent
     found, limits = shade_points(network, limits, variables, *given)
+    mask = surface.mask
     values = np.full((mask.size, *found.shape[1:]), background, np.float32)
     values[rows] = within_range(encoded, found)
     return values.reshape(*mask.shape, *found.shape[1:]), limits

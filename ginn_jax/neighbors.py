@@ -28,6 +28,8 @@ QUERY_BLOCK = 1 << 17
 WORD_BLOCK = 1 << 16
 # So many points lie so close that queries of a block, in no order, are far apart.
 MANY = 1 << 17
+# Points that are counted from elsewhere at a time.
+RUN = 1 << 12
 # Squares of lengths from 1 / FAR to FAR are normal numbers in float32.
 FAR = 1e18
 
@@ -55,7 +57,7 @@ def find_neighbors(
         return np.zeros(0, np.int32), np.zeros(0, np.int32)
     center = 0.5 * (points.min(0) + points.max(0))
     if len(points) > MANY:
-        near = np.asarray(as_points("queries", queries) - center, np.float32)
+        near = offsets_from(center, as_points("queries", queries))
         order = _along_curve(*pad_rows(near, bucket(len(near))))[: len(near)]
         pairs = _search(points, queries.take(order, axis=0), radius, center)
         return in_order(*pairs, order)
@@ -69,26 +71,39 @@ def _search(
     center: Float[np.ndarray, "3"],
 ) -> tuple[Int[np.ndarray, "E"], Int[np.ndarray, "E"]]:
     """`find_neighbors` block by block, coordinates counted from `center`."""
-    near_points = np.asarray(points - center, np.float32)
+    near_points = offsets_from(center, points)
     padded, mask = pad_rows(near_points, bucket(len(points)))
     grid = _build_grid(padded, mask, np.float32(radius))
     # Twice the rounding of the largest coordinate, for three axes and both ends.
     rounding = 2e-6 * radius + 8 * np.finfo(np.float32).eps * np.abs(near_points).max()
     certain, reach = max(radius - 2 * rounding, 0.0), radius + rounding
     shell = np.array([certain, reach], np.float32)
-    # As long as a block: NumPy is slow where it has to repeat three numbers.
-    middle = np.tile(center, min(len(queries), QUERY_BLOCK)).reshape(-1, 3)
 
     def search(first: int) -> list[tuple[Pairs, Int[np.ndarray, "K"]]]:
         block = as_points("queries", queries[first : first + QUERY_BLOCK])
-        near = np.empty(block.shape, np.float32)
-        np.subtract(block, middle[: len(block)], out=near, casting="same_kind")
-        found = _search_block(grid, near, shell, first)
+        found = _search_block(grid, offsets_from(center, block), shell, first)
         return [decide(pairs, points, queries, radius) for pairs in found]
 
     with ThreadPoolExecutor(available_cores()) as pool:
         blocks = pool.map(search, range(0, len(queries), QUERY_BLOCK))
         return join([part for block in blocks for part in block], pool)
+
+
+def offsets_from(
+    center: Float[np.ndarray, "3"], points: Shaped[np.ndarray, "*N 3"]
+) -> Float[np.ndarray, "*N 3"]:
+    """Coordinates counted from there in float32, the difference taken in float64.
+
+    Some at a time: NumPy is slow where it has to repeat three numbers.
+    """
+    flat = points.reshape(-1)
+    middle = np.tile(np.asarray(center, np.float64), min(len(flat) // 3, RUN))
+    near = np.empty(flat.shape, np.float32)
+    for first in range(0, len(flat), 3 * RUN):
+        part = flat[first : first + 3 * RUN]
+        kept = near[first : first + 3 * RUN]
+        np.subtract(part, middle[: len(part)], out=kept, casting="same_kind")
+    return near.reshape(points.shape)
 
 
 def as_rows(name: str, points: Any) -> Shaped[np.ndarray, "N 3"]:

@@ -34,6 +34,8 @@ def gradient(variables, batch, key):
 
 @pytest.fixture(scope="module")
 def given_batch():
+    """What `gradient` is given. Each of its traces is of a `partial` of its own, for
+    JAX knows nothing of a backend that is another one, and would take the first."""
     return tiny.fresh_state().variables, tiny.batch(), jax.random.key(2)
 
 
@@ -53,9 +55,9 @@ def test_gradients_and_demands_are_those_of_tiles(given_batch, in_tiles, on_gpu)
 
 def loops(jaxpr):
     """Loops of unknown length, in whatever is called too."""
-    inner = jaxprs_in_params
     return sum(
-        (equation.primitive.name == "while") + sum(map(loops, inner(equation.params)))
+        (equation.primitive.name == "while")
+        + sum(map(loops, jaxprs_in_params(equation.params)))
         for equation in jaxpr.eqns
     )
 
