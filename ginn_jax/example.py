@@ -24,7 +24,7 @@ from ginn_jax.geometry import Geometry, build_geometry, build_query_field
 from ginn_jax.limits import Demands, Limits
 from ginn_jax.ranges import compact
 from ginn_jax.receptive_field import Field, Oriented, input_count
-from ginn_jax.voxels import build_grid, morton_order
+from ginn_jax.voxels import VoxelGrid, morton_order
 
 
 class Asked(NamedTuple):
@@ -98,7 +98,8 @@ def blank_example(network: Network) -> Example:
     inputs = jnp.zeros((input_count(network.oriented), 1))
     field = Field(row, row, inputs, jnp.zeros(1), jnp.int32(1))
     fields = {conv.name: field for conv in network.encoder}
-    grid = build_grid(place, point.mask, jnp.float32(1))
+    # Of what is searched, parameters know nothing.
+    grid = VoxelGrid(place, row, row, row, place[0], place[0], jnp.zeros(3, jnp.int32))
     levels = (point,) * len(network.levels)
     material, light = (
         jnp.zeros((1, width)) if width else None

@@ -121,24 +121,25 @@ def make_example(
 def init_state(config: Training, variables: Variables | None = None) -> TrainState:
     """The state before the first step, of these weights or, by default, random ones."""
     if variables is None:
-        given, key = blank_example(config.network), jax.random.key(config.seed)
-        variables = jax.jit(partial(init_variables, config.network))(given, key=key)
+        return place(config, _random_state(config))
     # A step gives its state's memory away: not that of whoever gave the weights.
     return place(config, _first_state(config, jax.tree.map(jnp.array, variables)))
 
 
 def state_shapes(config: Training, where: Sharding | None = None) -> TrainState:
     """Shapes and types of a state that lies there, without any computation."""
-
-    def first(key: Key[Array, ""]) -> TrainState:
-        example = blank_example(config.network)
-        return _first_state(config, init_variables(config.network, example, key=key))
-
-    shapes = jax.eval_shape(first, jax.random.key(0))
+    shapes = jax.eval_shape(partial(_random_state, config))
     there = partial(jax.ShapeDtypeStruct, sharding=where)
     return jax.tree.map(lambda leaf: there(leaf.shape, leaf.dtype), shapes)
 
 
+@partial(jax.jit, static_argnums=0)
+def _random_state(config: Training) -> TrainState:
+    example, key = blank_example(config.network), jax.random.key(config.seed)
+    return _first_state(config, init_variables(config.network, example, key=key))
+
+
+@partial(jax.jit, static_argnums=0)
 def _first_state(config: Training, variables: Variables) -> TrainState:
     params, _ = split_variables(variables)
     optimizer = make_optimizer(config).init(params)

@@ -15,8 +15,8 @@ from ginn_jax.receptive_field import Oriented
 RADIUS = 0.5
 LEVELS = (0.1, 0.25)
 NETWORKS = {
-    density: compact_network(4, LEVELS, query_radius=0.25, density=density)
-    for density in ("surface", "kde")
+    "surface": compact_network(4, LEVELS, query_radius=0.25),
+    "kde": compact_network(4, LEVELS[:1], query_radius=0.25, density="kde"),
 }
 SHALLOW = compact_network(4, (0.25,), query_radius=0.25, density="kde")
 GENEROUS = {"points": 512, "edges": 1 << 14, "candidates": 1 << 15, "pairs": 1 << 16}

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -22,7 +23,7 @@ import tiny
 
 from ginn_jax import checkpoint, dataset, fit, room, run_record
 from ginn_jax.errors import InputError
-from ginn_jax.train import state_shapes
+from ginn_jax.train import StepReport, TrainState, state_shapes
 
 POINTS = 200
 LIT = replace(tiny.ONE_LEVEL, lights=1, local=True)
@@ -56,13 +57,37 @@ def train(folder, clouds, resume=False, progress=lambda *_: None, weights=None):
         return fit.fit(*given, weights=weights)
 
 
-def test_weights_that_are_given_are_trained_on(tmp_path):
+@partial(jax.jit, donate_argnums=0)
+def light_step(state, batch):
+    """A state that depends on all states and batches before it, like a real one."""
+    key = jax.random.fold_in(jax.random.key(CONFIG.seed), state.step)
+    pull = batch.target.mean() + jax.random.normal(key)
+    optimizer = jax.tree.map(lambda leaf: leaf + 1, state.optimizer)
+    pull += sum(leaf.mean() for leaf in jax.tree.leaves(optimizer))
+    variables = jax.tree.map(lambda leaf: 0.9 * leaf + pull, state.variables)
+    return TrainState(variables, optimizer, state.step + 1, state.skipped), pull
+
+
+def stand_in(put=setattr):
+    """A step and capacities that compile at once, where the run around is tested."""
+
+    def step(config, limits, state, batch):
+        state, loss = light_step(state, batch)
+        return state, StepReport(loss, loss, True, 1, {})
+
+    put(fit, "train_step", step)
+    put(fit, "training_room", lambda *_: tiny.ONE_LEVEL_ROOM)
+
+
+def test_weights_that_are_given_are_trained_on(tmp_path, monkeypatch):
+    stand_in(monkeypatch.setattr)
     shapes = state_shapes(CONFIG).variables
     zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
     found = train(tmp_path, [cloud(0)], weights=zeros).state.variables
-    # From nothing but zeros only the last bias has a gradient.
-    changed = [bool(np.any(leaf)) for leaf in jax.tree.leaves(found)]
-    assert sum(changed) == 1
+    # The same is done to all of them, and all began alike.
+    values = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(found)])
+    assert values[0] > 1
+    np.testing.assert_array_equal(values, values[0])
 
 
 def assert_finite(tree):
@@ -82,6 +107,8 @@ def bad_steps(clouds):
 def test_training_goes_on(tmp_path, monkeypatch):
     """One cloud is probed for capacities, so that others exceed them on the way."""
     monkeypatch.setattr(room, "PROBES", 1)
+    # What is raised holds more of the others too: a program less.
+    monkeypatch.setattr(room, "SLACK", 4.0)
     clouds, notes = stressful(), []
     found = train(tmp_path, clouds, progress=lambda s, x, note: notes.append(note))
     bad = bad_steps(clouds)
@@ -139,6 +166,8 @@ def main(folder, place, moment):
     elif place.startswith("writing"):
         killer.around(fit, "save_state", float(place.removeprefix("writing")))
 
+    stand_in()
+
     def told(step, loss=0.0, note=""):
         with open(folder / "log", "a") as log:
             log.write(f"{step}\n")
@@ -195,12 +224,10 @@ def unbroken(tmp_path_factory):
     return folder
 
 
-# Two at random; then before a life's first checkpoint; while the second is written
+# One at random; then before a life's first checkpoint; while the second is written
 # and the first is whole; with losses beyond the checkpoint; after steps that none has.
 RANDOM = random.Random(6)
-MOMENTS = [
-    (RANDOM.choice(("step", "files", "rename")), RANDOM.randint(1, 5)) for _ in range(2)
-]
+MOMENTS = [(RANDOM.choice(("step", "files", "rename")), RANDOM.randint(1, 5))]
 MOMENTS += [("rename", 3), ("writing.002", 2), ("files", 8), ("step", 8)]
 
 
@@ -257,7 +284,8 @@ def test_part_of_a_checkpoint_is_ignored_or_named(unbroken):
         (0.08, (1200, 1300), "clouds have from 1200 to 1300 points: cut them"),
     ],
 )
-def test_training_on_nothing_is_refused(tmp_path, radius, sizes, message):
+def test_training_on_nothing_is_refused(tmp_path, monkeypatch, radius, sizes, message):
+    monkeypatch.setattr(fit, "training_room", lambda *_: tiny.ONE_LEVEL_ROOM)
     network = replace(tiny.ONE_LEVEL, levels=(radius,))
     clouds = [tiny.sphere_on_plane(n, i) for i, n in enumerate(sizes)]
     config = replace(tiny.CONFIG, network=network, steps=3)
