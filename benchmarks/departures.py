@@ -111,9 +111,7 @@ def compare(
     done = experiment.train(console, config, clouds, run, {})
     variables = jax.device_put(done.state.variables, jax.devices()[0])
     model = evaluate.Model(variables, jax.random.key(options.seed))
-    seconds = done.seconds["train"]
-    row: dict[str, Any] = {"step_ms": 1e3 * seconds / options.steps}
-    row |= {"skipped": int(done.state.skipped)}
+    row: dict[str, Any] = {"skipped": int(done.state.skipped)}
     limits = done.limits
     for name, unseen in tests.items():
         called = [source.name for source in unseen.sources]
@@ -182,7 +180,7 @@ def write_report(options: Options, rows: list[dict[str, Any]]) -> str:
     errors = [name for name in rows[0] if name.startswith("relative, ")]
     heads = {"network": "network"}
     heads |= {name: f"relative 3D MSE, {name[10:]}" for name in errors}
-    heads |= {"step_ms": "train step, ms", "3d_ms": "f_3D, ms", "2d_ms": "f_2D, ms"}
+    heads |= {"3d_ms": "f_3D, ms", "2d_ms": "f_2D, ms"}
     changes = "; ".join(
         f"{name}: {', '.join(f'{k} = {v}' for k, v in change.items())}"
         for name, change in WITHOUT.items()
@@ -192,8 +190,8 @@ def write_report(options: Options, rows: list[dict[str, Any]]) -> str:
 {options.steps} steps each on {options.shapes} shapes of {options.points} points at
 {options.rays} rays, batches of two; one run each, so that differences as small as that
 between the two rows of ours may be chance. Errors are those of unseen objects, noise
-subtracted; times those of an image of {options.resolution} x {options.resolution}; of
-training, compilation apart. Without what: {changes}.
+subtracted; times those of an image of {options.resolution} x {options.resolution}.
+Without what: {changes}.
 
 {describe()}
 

@@ -1,6 +1,7 @@
 """Every test runs with the library's annotations checked and no silent promotion."""
 
 import gc
+import math
 import os
 
 # XLA says of every compiled function that it finds in the cache that it may not fit.
@@ -89,6 +90,20 @@ def full_compiling(cheap_compiling):
 
     with tiny.full_compiling():
         yield
+
+
+@pytest.fixture
+def small_programs(monkeypatch):
+    """For whole scripts: few programs, all small, and no process beside this one."""
+    import tiny
+
+    from ginn_jax import blocks, limits, scenes
+
+    # Each is tested where it belongs: processes with the scenes, fitting with images.
+    monkeypatch.setattr(scenes, "ProcessPoolExecutor", tiny.Here)
+    monkeypatch.setattr(limits, "LOOSE", math.inf)
+    # Every picture has full blocks, so one shape is compiled.
+    monkeypatch.setattr(blocks, "BLOCK", 128)
 
 
 @pytest.fixture

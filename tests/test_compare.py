@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments import evaluate as experiment
-from ginn_jax import blocks, checkpoint, pretrained, report, run_record, scenes
+from ginn_jax import checkpoint, pretrained, report, run_record, scenes
 from ginn_jax.compare_figures import inset_place
 from ginn_jax.compare_networks import OURS, others_beside, redrawn, warn_of_seen
 from ginn_jax.compare_report import (
@@ -114,13 +114,6 @@ def finished_run(folder, network=tiny.ONE_LEVEL):
     return folder
 
 
-@pytest.fixture
-def small_blocks(monkeypatch):
-    monkeypatch.setattr(scenes, "ProcessPoolExecutor", tiny.Here)
-    # Every picture has full blocks, so one shape is compiled.
-    monkeypatch.setattr(blocks, "BLOCK", 128)
-
-
 def test_draws_are_distinct_and_none_is_the_networks_own():
     own = tiny.NETWORK, tiny.LIMITS, Model({}, jax.random.key(3))
     drawn = [own, *redrawn(own, 3)]
@@ -165,7 +158,7 @@ def test_scenes_that_a_run_trained_on_are_named(scene, seen, tmp_path, caplog):
     assert not seen or f"called {seen}: " in said[0]
 
 
-@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.usefixtures("small_programs")
 def test_light_is_compared_with_tracing_plain_and_denoised(tmp_path, monkeypatch):
     """By a denoiser that leaves the image as it is."""
     network = replace(tiny.ONE_LEVEL, lights=1, materials=3, asks="all", local=True)
@@ -234,7 +227,7 @@ def test_light_is_compared_with_tracing_plain_and_denoised(tmp_path, monkeypatch
     assert results[OURS]["mse_3d"] == results["2D only"]["mse_3d"]
 
 
-@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.usefixtures("small_programs")
 def test_comparison_ends_in_a_report_and_keeps_its_references(tmp_path):
     run = finished_run(tmp_path / "run")
     options = experiment.Options(

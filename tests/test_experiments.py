@@ -11,7 +11,6 @@ import pytest
 import tiny
 
 from experiments import ao_train
-from ginn_jax import blocks
 from ginn_jax.errors import InputError
 
 ROOT = Path(__file__).parents[1]
@@ -87,10 +86,9 @@ def test_options_that_cannot_be_meant_are_refused(wrong):
         ao_train.main(replace(SMALL, **wrong))
 
 
+@pytest.mark.usefixtures("small_programs")
 def test_a_small_run_leaves_all_that_is_promised(tmp_path, monkeypatch):
     monkeypatch.setitem(ao_train.presets.PRESETS, "default", tiny.ONE_LEVEL)
-    # Every frame has full blocks, so one shape is compiled.
-    monkeypatch.setattr(blocks, "BLOCK", 128)
     with tiny.cheap_compiling(), jax.numpy_dtype_promotion("standard"):
         ao_train.main(replace(SMALL, out=tmp_path))
     metrics = json.loads((tmp_path / "metrics.json").read_text())

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from benchmarks import poisson_radii, sample_counts
 from experiments import animation, environment_maps, evaluate, latent_features
-from ginn_jax import blocks, compare_networks, pretrained, train
+from ginn_jax import compare_networks, pretrained, train
 from ginn_jax.dataset import count_given
 from ginn_jax.errors import InputError
 
@@ -32,10 +32,7 @@ def untrained(effect):
 
 
 @pytest.fixture(autouse=True)
-def tiny_networks(monkeypatch):
-    # Every picture has full blocks, so one shape is compiled.
-    monkeypatch.setattr(blocks, "BLOCK", 128)
-
+def tiny_networks(monkeypatch, small_programs):
     def load(effect, name):
         if name and pretrained.run_folder(name):
             return pretrained.load_network(effect, name)
@@ -53,7 +50,7 @@ def test_animation_tells_the_flicker_of_every_method(tmp_path, effect, disks):
         frames=3,
         resolution=40,
         reference=16,
-        points=1500,
+        points=1200,
         draws=2,
         disks=disks,
     )
@@ -93,7 +90,7 @@ def test_a_network_of_another_occlusion_radius_is_refused(tmp_path):
 
 def test_every_light_has_its_error_and_its_picture(tmp_path):
     options = environment_maps.Options(
-        out=tmp_path, lights=1, point_lights=1, resolution=40, reference=8, points=1500
+        out=tmp_path, lights=1, point_lights=1, resolution=40, reference=8, points=1200
     )
     metrics = environment_maps.main(options)
     assert [r["light"] for r in metrics["lights"]] == ["sky 10000000", "point light 0"]
@@ -102,10 +99,9 @@ def test_every_light_has_its_error_and_its_picture(tmp_path):
     assert "point light 0" in (tmp_path / "report.md").read_text()
 
 
-@pytest.mark.parametrize("effect", ["ao", "gi"])
-def test_fewer_samples_are_given_and_others_asked(tmp_path, effect):
+def test_fewer_samples_are_given_and_others_asked(tmp_path):
     options = sample_counts.Options(
-        effect,
+        "ao",
         out=tmp_path,
         objects=1,
         shares=(1.0, 0.5),
@@ -133,10 +129,9 @@ def test_shares_of_a_cloud_are_of_both_its_parts(count, share):
     assert rows.max() < count
 
 
-@pytest.mark.parametrize("effect", ["ao", "gi"])
-def test_every_disk_radius_has_its_time_and_its_errors(tmp_path, effect):
+def test_every_disk_radius_has_its_time_and_its_errors(tmp_path):
     options = poisson_radii.Options(
-        effect,
+        "gi",
         out=tmp_path,
         objects=1,
         times=(1.0, 1.25),
@@ -159,7 +154,7 @@ def test_every_disk_radius_has_its_time_and_its_errors(tmp_path, effect):
 @pytest.mark.parametrize("effect", ["ao", "gi"])
 def test_latent_features_are_drawn(tmp_path, effect):
     options = latent_features.Options(
-        effect, out=tmp_path, channels=2, resolution=40, points=1500
+        effect, out=tmp_path, channels=2, resolution=40, points=1200
     )
     assert latent_features.main(options).stat().st_size > 1000
 

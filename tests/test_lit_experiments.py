@@ -12,7 +12,7 @@ import tiny
 from benchmarks import frame, generation
 from benchmarks import relight as relight_benchmark
 from experiments import gi_train, sss_train
-from ginn_jax import blocks, evaluate, evaluate_light, presets, scenes, train
+from ginn_jax import blocks, evaluate, evaluate_light, presets, train
 from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import LitCloud
 from ginn_jax.lit_options import LitOptions, choose_sources
@@ -36,14 +36,12 @@ EFFECTS = {
 }
 
 
+@pytest.mark.usefixtures("small_programs")
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_a_small_run_leaves_all_that_is_promised(effect, tmp_path, monkeypatch):
     script, table, more = EFFECTS[effect]
     network = replace(tiny.ONE_LEVEL, lights=1, **more)
     monkeypatch.setitem(table, "homogeneous", network)
-    monkeypatch.setattr(blocks, "BLOCK", 128)
-    # Workers are tested with the scenes.
-    monkeypatch.setattr(scenes, "ProcessPoolExecutor", tiny.Here)
     # That they are measured is tested where occlusion is.
     limits = uniform_limits(network, 1 << 15)
     monkeypatch.setattr("ginn_jax.fit.training_room", lambda *_: Room(limits, limits))
@@ -240,6 +238,7 @@ def test_grey_light_on_grey_things_is_one_channel():
     assert evaluate_light.distinct_channels(numbers, coloured)[1].shape[0] == 3
 
 
+@pytest.mark.usefixtures("small_programs")
 def test_relight_and_frame_benchmarks(tmp_path, monkeypatch):
     options = relight_benchmark.Options(
         out=tmp_path, resolution=24, points=1000, repeats=1, networks=("ao",)
@@ -250,7 +249,6 @@ def test_relight_and_frame_benchmarks(tmp_path, monkeypatch):
         relight_benchmark.main(replace(options, networks=("none",)))
     network = replace(tiny.ONE_LEVEL, lights=1, materials=1)
     config = replace(tiny.CONFIG, network=network)
-    monkeypatch.setattr(blocks, "BLOCK", 128)
     with tiny.cheap_compiling():
         weights = jax.device_get(train.init_state(config).variables)
         trained = config, tiny.ONE_LEVEL_LIMITS, weights

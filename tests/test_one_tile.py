@@ -1,5 +1,6 @@
 """What a GPU computes in one tile without loops is what a CPU does tile by tile."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -23,29 +24,35 @@ def on_gpu(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
 
 
-def gradient(variables, batch, key):
+def gradient(config, limits, variables, batch, key):
     """Loss and gradient of a batch, from its Poisson disks on, and all demands."""
-    example, demands = train.make_example(tiny.CONFIG, tiny.LIMITS, batch, key=key)
+    example, demands = train.make_example(config, limits, batch, key=key)
     differentiate = jax.value_and_grad(objective.batch_loss, has_aux=True)
     split = objective.split_variables(variables)
-    (loss, _), found = differentiate(*split, tiny.NETWORK, example)
+    (loss, _), found = differentiate(*split, config.network, example)
     return loss, found, demands
 
 
-@pytest.fixture(scope="module")
-def given_batch():
-    """What `gradient` is given. Each of its traces is of a `partial` of its own, for
-    JAX knows nothing of a backend that is another one, and would take the first."""
-    return tiny.fresh_state().variables, tiny.batch(), jax.random.key(2)
+def prepare(config, limits):
+    """The function to trace, another one each time, and what it is given: JAX knows
+    nothing of a backend that is another one, and would take what it traced before."""
+    state = tiny.fresh_state(config, limits)
+    inputs = state.variables, tiny.batch(), jax.random.key(2)
+    return partial(gradient, config, limits), inputs
+
+
+ONE_LEVEL = replace(tiny.CONFIG, network=tiny.ONE_LEVEL), tiny.ONE_LEVEL_LIMITS
 
 
 @pytest.fixture(scope="module")
-def in_tiles(given_batch):
-    return jax.jit(partial(gradient))(*given_batch)
+def in_tiles():
+    traced, inputs = prepare(*ONE_LEVEL)
+    return jax.jit(traced)(*inputs)
 
 
-def test_gradients_and_demands_are_those_of_tiles(given_batch, in_tiles, on_gpu):
-    loss, found, demands = jax.jit(partial(gradient))(*given_batch)
+def test_gradients_and_demands_are_those_of_tiles(in_tiles, on_gpu):
+    traced, inputs = prepare(*ONE_LEVEL)
+    loss, found, demands = jax.jit(traced)(*inputs)
     assert jax.tree.map(int, demands) == jax.tree.map(int, in_tiles[2])
     np.testing.assert_allclose(loss, in_tiles[0], rtol=1e-6)
     largest = max(float(jnp.abs(a).max()) for a in jax.tree.leaves(in_tiles[1]))
@@ -62,10 +69,11 @@ def loops(jaxpr):
     )
 
 
-def test_only_poisson_disks_wait_for_the_host(given_batch, on_gpu):
+def test_only_poisson_disks_wait_for_the_host(on_gpu):
     """A loop of unknown length takes a round trip a turn, which is longer than most of
     what is in it; of a disk nobody knows how many rounds it takes."""
-    jaxpr = jax.make_jaxpr(partial(gradient))(*given_batch).jaxpr
+    traced, inputs = prepare(tiny.CONFIG, tiny.LIMITS)
+    jaxpr = jax.make_jaxpr(traced)(*inputs).jaxpr
     assert loops(jaxpr) == len(tiny.NETWORK.levels)
 
 
