@@ -1,5 +1,6 @@
 """Levels of a cloud that moves: points that were kept are kept again."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -147,19 +148,19 @@ def test_an_encoding_takes_what_the_one_before_kept():
     rng = np.random.default_rng(0)
     variables = jax.tree.map(
         lambda leaf: rng.normal(size=leaf.shape).astype(leaf.dtype),
-        state_shapes(tiny.CONFIG).variables,
+        state_shapes(replace(tiny.CONFIG, network=tiny.ONE_LEVEL)).variables,
     )
     given = variables, points.position, points.normal
     one, two = jax.random.split(jax.random.key(0))
 
     def encode(before, key):
-        network = tiny.NETWORK
+        network, limits = tiny.ONE_LEVEL, tiny.ONE_LEVEL_LIMITS
         made, _ = inference.encode_cloud(
-            network, tiny.LIMITS, *given, kept_before=before, key=key
+            network, limits, *given, kept_before=before, key=key
         )
         return made
 
-    nothing = inference.nothing_kept(tiny.NETWORK, 1000)
+    nothing = inference.nothing_kept(tiny.ONE_LEVEL, 1000)
     first = encode(nothing, one)
     assert first.kept is not None
     np.testing.assert_array_equal(first.kept, encode(None, one).kept)

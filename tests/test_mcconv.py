@@ -27,6 +27,8 @@ from ginn_jax import kernels
 from ginn_jax import mcconv as mc
 from ginn_jax import receptive_field as rf
 
+pytestmark = pytest.mark.usefixtures("cheap_compiling")
+
 
 def map_points(case, change):
     """The case with `change` applied to all positions."""
@@ -128,6 +130,7 @@ def loop_value(case, variant, mixes, group):
     return result
 
 
+@pytest.mark.usefixtures("full_compiling")
 @VARIANTS
 @pytest.mark.parametrize(("mixes", "group"), [(False, 2), (True, 4), (True, 6)])
 @settings(max_examples=8)

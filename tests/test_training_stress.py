@@ -23,6 +23,8 @@ import tiny
 
 from ginn_jax import checkpoint, dataset, fit, room, run_record
 from ginn_jax.errors import InputError
+from ginn_jax.presets import only_2d
+from ginn_jax.searches import uniform_limits
 from ginn_jax.train import StepReport, TrainState, state_shapes
 
 POINTS = 200
@@ -285,8 +287,10 @@ def test_part_of_a_checkpoint_is_ignored_or_named(unbroken):
     ],
 )
 def test_training_on_nothing_is_refused(tmp_path, monkeypatch, radius, sizes, message):
-    monkeypatch.setattr(fit, "training_room", lambda *_: tiny.ONE_LEVEL_ROOM)
-    network = replace(tiny.ONE_LEVEL, levels=(radius,))
+    network = only_2d(replace(tiny.ONE_LEVEL, levels=(radius,)))
+    limits = uniform_limits(network, 1 << 15)
+    ample = room.Room(limits, limits)
+    monkeypatch.setattr(fit, "training_room", lambda *_: ample)
     clouds = [tiny.sphere_on_plane(n, i) for i, n in enumerate(sizes)]
     config = replace(tiny.CONFIG, network=network, steps=3)
     optax = jax.numpy_dtype_promotion("standard")
