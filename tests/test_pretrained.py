@@ -173,6 +173,15 @@ def test_every_network_loads_and_is_small(name):
     assert (pretrained.FOLDER / f"{name}.npz").stat().st_size < 2e6
 
 
+@pytest.fixture(scope="module")
+def scenes_once():
+    """The scene of a finer network is that of the other."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(export, "lit_cloud", cache(export.lit_cloud))
+        yield
+
+
+@pytest.mark.usefixtures("scenes_once")
 @pytest.mark.parametrize("name", FULL + FINE)
 def test_the_error_on_the_fixed_scene_is_the_stored_one(name):
     """One of them in the code that users' calls compile to."""
