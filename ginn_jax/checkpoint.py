@@ -34,6 +34,10 @@ def open_manager(folder: Path, fresh: bool = False) -> ocp.CheckpointManager:
     """The checkpoints of a run; the newest `KEPT` stay. Close it when done.
 
     `fresh` removes those of an earlier run.
+
+    Raises:
+        InputError: a folder that cannot be written, or notes on a checkpoint that
+            cannot be read.
     """
     path = folder / CHECKPOINTS
     options = ocp.CheckpointManagerOptions(
@@ -57,8 +61,20 @@ def open_reader(folder: Path) -> ocp.CheckpointManager:
 
 def _manager(path: Path, options: ocp.CheckpointManagerOptions) -> Any:
     handler = ocp.StandardCheckpointHandler()
-    return ocp.CheckpointManager(
-        path.absolute(), options=options, item_handlers=handler
+    try:
+        return ocp.CheckpointManager(
+            path.absolute(), options=options, item_handlers=handler
+        )
+    except OSError:
+        raise
+    except Exception as error:  # what Orbax makes of damage in what it notes of each
+        raise _unreadable(f"one of {path.absolute()}", error) from None
+
+
+def _unreadable(what: str, error: Exception) -> InputError:
+    reason = str(error).splitlines()[0][:80] if str(error) else type(error).__name__
+    return InputError(
+        f"checkpoint {what} cannot be read ({reason}): delete it or start anew"
     )
 
 
@@ -113,10 +129,7 @@ def restore_state(
         found = manager.restore(step, args=ocp.args.StandardRestore(shapes))
     except Exception as error:
         folder = Path(str(manager.directory)) / str(step)
-        reason = str(error).splitlines()[0][:80] if str(error) else type(error).__name__
-        raise InputError(
-            f"checkpoint {folder} cannot be read ({reason}): delete it or start anew"
-        ) from None
+        raise _unreadable(str(folder), error) from None
     return TrainState(**found)
 
 

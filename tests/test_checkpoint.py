@@ -125,6 +125,15 @@ def test_damaged_checkpoint_is_refused(third, saved, tmp_path):
     assert refused >= 2
 
 
+def test_damaged_notes_on_a_checkpoint_are_refused(saved, tmp_path):
+    shutil.copytree(saved, tmp_path / "run")
+    [notes] = (tmp_path / "run").rglob("*_CHECKPOINT_METADATA")
+    notes.write_text('{"unknown": 1, "custom_metadata": {"known": 2}}')
+    _, reason = restore_or_reason(tmp_path / "run")
+    assert reason is not None
+    assert str(tmp_path / "run" / "checkpoints") in reason
+
+
 def test_checkpoint_of_another_network_is_refused(third, tmp_path):
     encoder = third.variables["encoder"]
     less = {k: v for k, v in encoder["params"].items() if k != "conv_0"}
