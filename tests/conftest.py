@@ -42,6 +42,7 @@ LONGEST = (
     "lit_experiments",
     "relight",
     "training_stress",
+    "killed_runs",
     "capacities",
     "train",
     "experiments",
