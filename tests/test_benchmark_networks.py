@@ -9,8 +9,6 @@ import tiny
 
 from benchmarks import departures, networks
 from ginn_jax.presets import PAPER
-from ginn_jax.room import Room
-from ginn_jax.searches import uniform_limits
 
 
 @pytest.mark.usefixtures("small_programs")
@@ -22,8 +20,8 @@ def test_networks_at_equal_time(tmp_path, monkeypatch):
     monkeypatch.setattr(networks, "ILLUMINATION", table)
     seconds = iter([0.5, 0.3])
     monkeypatch.setattr(networks, "step_seconds", lambda *_: next(seconds))
-    limits = uniform_limits(network, 1 << 15)
-    monkeypatch.setattr("ginn_jax.fit.training_room", lambda *_: Room(limits, limits))
+    room = tiny.ample_room(network)
+    monkeypatch.setattr("ginn_jax.fit.training_room", lambda *_: room)
     options = networks.Options(
         tmp_path,
         presets=tuple(table),
@@ -82,9 +80,9 @@ def test_every_departure_is_left_out_alone_and_all_at_once():
 
 @pytest.mark.usefixtures("small_programs")
 def test_departures(tmp_path, monkeypatch):
-    network, limits = tiny.ONE_LEVEL, tiny.ONE_LEVEL_LIMITS
+    network, room = tiny.ONE_LEVEL, tiny.ONE_LEVEL_ROOM
     monkeypatch.setattr(departures, "variants", lambda _: {"ours": network})
-    monkeypatch.setattr("ginn_jax.fit.training_room", lambda *_: Room(limits, limits))
+    monkeypatch.setattr("ginn_jax.fit.training_room", lambda *_: room)
     options = departures.Options(
         tmp_path, steps=2, shapes=2, test_shapes=1, points=1000, rays=4, resolution=32
     )

@@ -113,13 +113,10 @@ def launch(folder, place, moment):
     """Whether a run in another process came to its end."""
     folder.mkdir(exist_ok=True)
     here = Path(__file__).parent
-    # Every life is a process, but they need not compile the same programs.
-    programs = {"JAX_COMPILATION_CACHE_DIR": str(folder.parent / "programs")}
-    programs |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
     paths = [str(here), str(here.parent), os.environ.get("PYTHONPATH", "")]
     done = subprocess.run(
         [sys.executable, __file__, folder, place, str(moment)],
-        env=os.environ | programs | {"PYTHONPATH": os.pathsep.join(paths)},
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
         capture_output=True,
         text=True,
         timeout=300,

@@ -16,8 +16,6 @@ from ginn_jax import blocks, evaluate, evaluate_light, presets, train
 from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import LitCloud
 from ginn_jax.lit_options import LitOptions, choose_sources
-from ginn_jax.room import Room
-from ginn_jax.searches import uniform_limits
 from ginn_jax.shading import Encoded
 
 SMALL = {
@@ -43,8 +41,8 @@ def test_a_small_run_leaves_all_that_is_promised(effect, tmp_path, monkeypatch):
     network = replace(tiny.ONE_LEVEL, lights=1, **more)
     monkeypatch.setitem(table, "homogeneous", network)
     # That they are measured is tested where occlusion is.
-    limits = uniform_limits(network, 1 << 15)
-    monkeypatch.setattr("ginn_jax.fit.training_room", lambda *_: Room(limits, limits))
+    room = tiny.ample_room(network)
+    monkeypatch.setattr("ginn_jax.fit.training_room", lambda *_: room)
     options = script.Options(out=tmp_path, **SMALL)
     with tiny.cheap_compiling(), jax.numpy_dtype_promotion("standard"):
         script.main(options)

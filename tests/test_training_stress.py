@@ -11,7 +11,6 @@ from short_run import CONFIG, cloud, train
 from ginn_jax import checkpoint, dataset, fit, room
 from ginn_jax.errors import InputError
 from ginn_jax.presets import only_2d
-from ginn_jax.searches import uniform_limits
 
 
 def stressful():
@@ -74,9 +73,7 @@ def test_training_goes_on(tmp_path, monkeypatch):
 )
 def test_training_on_nothing_is_refused(tmp_path, monkeypatch, radius, sizes, message):
     network = only_2d(replace(tiny.ONE_LEVEL, levels=(radius,)))
-    limits = uniform_limits(network, 1 << 15)
-    ample = room.Room(limits, limits)
-    monkeypatch.setattr(fit, "training_room", lambda *_: ample)
+    monkeypatch.setattr(fit, "training_room", lambda *_: tiny.ample_room(network))
     clouds = [tiny.sphere_on_plane(n, i) for i, n in enumerate(sizes)]
     config = replace(tiny.CONFIG, network=network, steps=3)
     optax = jax.numpy_dtype_promotion("standard")

@@ -48,6 +48,12 @@ ONE_LEVEL_LIMITS = uniform_limits(ONE_LEVEL, 1 << 15)
 ONE_LEVEL_ROOM = Room(ONE_LEVEL_LIMITS, ONE_LEVEL_LIMITS)
 
 
+def ample_room(network):
+    """One size of room for a step of another such network."""
+    limits = uniform_limits(network, 1 << 15)
+    return Room(limits, limits)
+
+
 def sphere_on_plane(count, seed):
     """Points on a sphere of diameter 1 and the plane under it, with their openness.
 
