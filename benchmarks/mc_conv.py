@@ -7,6 +7,8 @@ times the features of the sender, summed at the receiver; gradients of all weigh
 of the features. The batch has a cloud for every core, as in training. Ours gives each
 core its cloud. PyTorch's takes the batch as one cloud on all cores, or each cloud on a
 thread of its own, whichever is faster. Results are compared before anything is timed.
+Points come in coherent order, as f_3D has them, and once more in random order, in which
+the rows that edges gather lie far apart in memory.
 Open3D's ContinuousConv is another layer (a grid of weights instead of a perceptron):
 its time stands beside, not its result, and is of one cloud.
 """
@@ -15,6 +17,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +35,10 @@ from ginn_jax.kernels import Kernel
 from ginn_jax.mcconv import mc_conv
 from ginn_jax.process import ALONE
 from ginn_jax.receptive_field import Field
+from ginn_jax.voxels import morton_order
 
 TOLERANCE = 1e-4
+ORDERS = "coherent", "random"
 
 
 @dataclass(frozen=True)
@@ -129,17 +134,25 @@ def check(mine: Calls, theirs: Calls) -> float:
     return worst
 
 
-def compare(options: Options, cloud: str, radius: float) -> dict[str, Any]:
+def in_coherent_order(points: np.ndarray) -> np.ndarray:
+    """The points with neighbours together."""
+    return points[np.asarray(morton_order(points, np.ones(len(points), bool)))]
+
+
+def compare(options: Options, cloud: str, radius: float, order: str) -> dict[str, Any]:
     """Agreement and times on one cloud."""
     rng = np.random.default_rng(options.seed)
     draw = {"uniform": uniform, "surface": surface}[cloud]
     clouds = [draw(rng, options.points) for _ in range(jax.device_count())]
+    if order == "coherent":
+        clouds = [in_coherent_order(points) for points in clouds]
     widths = options.channels, options.hidden
     layer = make_layer(clouds, radius, *widths, options.seed)
     mine = ours(layer)
     calls = {f"ours, {name}": call for name, call in mine.items()}
-    case: dict[str, Any] = {"cloud": cloud, "radius": radius, "missing": []}
-    case |= {"edges": int(layer.edges.count.sum()), "difference": float("nan")}
+    case: dict[str, Any] = {"cloud": cloud, "radius": radius, "order": order}
+    case |= {"missing": [], "edges": int(layer.edges.count.sum())}
+    case["difference"] = float("nan")
     for name, peer in PEERS.items():
         try:
             theirs = peer(layer)
@@ -156,27 +169,27 @@ def compare(options: Options, cloud: str, radius: float) -> dict[str, Any]:
 
 
 def main(options: Options) -> dict[str, Any]:
-    """Compare on two clouds; returns what metrics.json holds."""
+    """Compare on two clouds in two orders; returns what metrics.json holds."""
     require(options, {"points": 100, "channels": 1, "hidden": 1, "repeats": 1})
     require_positive(options, "radii")
     require_some(options, "radii")
     begin = time.perf_counter()
-    cases = [
-        compare(options, c, r) for r in options.radii for c in ("uniform", "surface")
-    ]
+    kinds = product(ORDERS, options.radii, ("uniform", "surface"))
+    cases = [compare(options, c, r, order) for order, r, c in kinds]
     return write_cases(options, cases, write_report(options, cases), begin)
 
 
 def write_report(options: Options, cases: list[dict[str, Any]]) -> str:
-    """report.md: times and ratios, a row for each cloud and radius."""
+    """report.md: times and ratios, a row for each order, radius and cloud."""
     names = list(cases[0]["timings"])
-    heads = ["cloud", "radius", "edges", *names]
+    heads = ["order", "cloud", "radius", "edges", *names]
     peers = [name for name in PEERS if f"{name}, gradient" in names]
     heads += ["best / ours, forward", "best / ours, gradient"] if peers else []
     rows = []
     for case in cases:
         t = case["timings"]
         row = [
+            case["order"],
             case["cloud"],
             case["radius"],
             case["edges"],
