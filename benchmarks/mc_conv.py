@@ -24,6 +24,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from benchmarks.mc_conv_peers import INPUTS, PEERS, Calls, Layer, make_layer
 from benchmarks.neighbors import surface, uniform
@@ -79,12 +80,13 @@ def ours(layer: Layer) -> Calls:
             made = forward(kernel, (features, *cloud[1:]))
             return jnp.sum(made * cloud[2])
 
-        return jax.grad(objective, argnums=(0, 1))(kernel, cloud[0])
+        of_kernel, of_features = jax.grad(objective, argnums=(0, 1))(kernel, cloud[0])
+        return ravel_pytree(of_kernel)[0], of_features
 
     @partial(jax.jit, compiler_options=ALONE)
     def all_gradients(kernel: Kernel, batch: Any) -> Any:
         kernels, features = for_each_block(gradient, kernel, batch)
-        return jax.tree.map(lambda a: a.sum(axis=0), kernels), features
+        return ravel_pytree(kernel)[1](kernels.sum(axis=0)), features
 
     @partial(jax.jit, compiler_options=ALONE)
     def all_forward(kernel: Kernel, batch: Any) -> Any:
@@ -136,7 +138,8 @@ def check(mine: Calls, theirs: Calls) -> float:
 
 def in_coherent_order(points: np.ndarray) -> np.ndarray:
     """The points with neighbours together."""
-    return points[np.asarray(morton_order(points, np.ones(len(points), bool)))]
+    everyone = jnp.ones(len(points), bool)
+    return points[np.asarray(morton_order(jnp.asarray(points), everyone))]
 
 
 def compare(options: Options, cloud: str, radius: float, order: str) -> dict[str, Any]:

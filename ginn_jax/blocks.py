@@ -144,7 +144,7 @@ def for_each_block(function: Callable[[Any, Any], Any], shared: Any, turn: Any) 
     """
 
     def own(shared: Any, turn: Any) -> Any:
-        made = function(shared, jax.tree.map(lambda a: a[0], turn))
+        made = function(shared, jax.tree.map(lambda a: a.squeeze(0), turn))
         return jax.tree.map(lambda a: a[None], made)
 
     each = PartitionSpec(_EACH)

@@ -1,7 +1,10 @@
 """Queries in turns of a block for every device."""
 
+from functools import partial
+
 import jax
 import numpy as np
+import pytest
 import two_devices
 from hypothesis import given
 from hypothesis import strategies as st
@@ -10,6 +13,7 @@ from ginn_jax import blocks
 
 TWO_DEVICES = """
 import numpy as np
+import pytest
 from dataclasses import replace
 import test_relight as cases
 import tiny
@@ -71,3 +75,12 @@ def test_what_is_split_into_turns_comes_back_in_rows(count, size, channels):
     rows = blocks.in_rows([turn[..., 1] for turn in split])
     np.testing.assert_array_equal(rows[:count], numbers[..., 1].T)
     assert not rows[count:].any()
+
+
+def test_no_block_is_dropped():
+    """Of two blocks for one device the second would be lost."""
+    count = jax.device_count()
+    add = partial(blocks.for_each_block, lambda shared, block: shared + block, 1.0)
+    np.testing.assert_array_equal(add(np.zeros((count, 3))), np.ones((count, 3)))
+    with pytest.raises(ValueError, match="squeeze"):
+        add(np.zeros((2 * count, 3)))
