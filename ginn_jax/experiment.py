@@ -147,7 +147,7 @@ def train(
     Raises:
         InputError: as `fit.fit`; weights to start from that are of another network.
     """
-    begin, weights = time.perf_counter(), None
+    weights, told = None, list[tuple[int, float]]()
     if options.start is not None:
         weights = starting_weights(options.start, config)
     extra = extra | {"start": options.start}
@@ -155,8 +155,8 @@ def train(
         task = progress.add_task("training", total=config.steps, note="compiling")
 
         def tell(step: int, loss: float, note: str) -> None:
-            rate = step / max(time.perf_counter() - begin, 1e-9)
-            text = note or f"loss {loss:.5f}, {rate:.1f} steps/s"
+            told.append((step, time.perf_counter()))
+            text = note or f"loss {loss:.5f}{pace(told)}"
             progress.update(task, completed=step, note=text)
             if not console.is_terminal and (note or step % 100 == 0):
                 console.print(f"step {step} of {config.steps}: {text}")
@@ -165,6 +165,13 @@ def train(
         run = fit.fit(*given, extra, weights)
     forget_programs()
     return run
+
+
+def pace(told: Sequence[tuple[int, float]]) -> str:
+    """Steps a second since the first of these (step, second) was told: without what was
+    compiled before, or trained before a run was resumed."""
+    (first, begin), (last, end) = told[0], told[-1]
+    return f", {(last - first) / (end - begin):.1f} steps/s" if last > first else ""
 
 
 def training(

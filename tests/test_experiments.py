@@ -11,6 +11,7 @@ import pytest
 import tiny
 
 from experiments import ao_train
+from ginn_jax import experiment
 from ginn_jax.errors import InputError
 
 ROOT = Path(__file__).parents[1]
@@ -104,3 +105,10 @@ def test_a_small_run_leaves_all_that_is_promised(tmp_path, monkeypatch):
     text = (tmp_path / "report.md").read_text()
     assert "unseen shapes | 2 |" in text
     assert "rays of equal MSE" in text
+
+
+def test_pace_of_a_resumed_run_is_its_own():
+    """2,900 steps came before it, and a minute went by until the first was told."""
+    told = [(2910, 60.0), (2920, 65.0), (2960, 75.0)]
+    assert experiment.pace(told) == ", 3.3 steps/s"
+    assert experiment.pace(told[:1]) == ""
