@@ -108,7 +108,7 @@ def compare(
 ) -> dict[str, Any]:
     """Errors and times of one network after its training."""
     config = experiment.training(run, network, options.points, len(clouds))
-    done = experiment.train(console, config, clouds, run, {})
+    done = experiment.train(console, config, clouds, run, {}, experiment.Clock())
     variables = jax.device_put(done.state.variables, jax.devices()[0])
     model = evaluate.Model(variables, jax.random.key(options.seed))
     row: dict[str, Any] = {"skipped": int(done.state.skipped)}

@@ -140,7 +140,7 @@ def compare(
     plain = plain_call(network, variables, alone, queries)
     expected = image.as_openness(np.asarray(plain()[0]))
     difference = float(np.abs(ours()[mask] - expected).max())
-    if difference > 1e-4:
+    if not difference <= 1e-4:
         raise AssertionError(f"results differ by {difference}")
     calls: dict[str, Callable[[], Any]] = {"ours": ours, "straightforward": plain}
     calls |= {"ours" + at_scale(s): partial(ours, s) for s in options.scales}

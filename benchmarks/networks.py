@@ -119,7 +119,7 @@ def compare(
     steps = max(round(options.seconds / step_seconds(config, clouds)), 1)
     forget_programs()
     config, run = replace(config, steps=steps), replace(run, steps=steps)
-    done = experiment.train(console, config, clouds, run, {})
+    done = experiment.train(console, config, clouds, run, {}, experiment.Clock())
     variables = jax.device_put(done.state.variables, jax.devices()[0])
     model = Model(variables, jax.random.key(run.seed))
     made = {"steps": steps, "seconds": done.seconds["train"]}

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 
 from ginn_jax.errors import InputError
-from ginn_jax.irradiance import direct_irradiance, indirect_irradiance, light_scene
+from ginn_jax.irradiance import indirect_irradiance, light_scene
 from ginn_jax.lighting import PointLight, constant_sky
 from ginn_jax.mesh import Mesh
 from ginn_jax.reference import ambient_occlusion
@@ -53,14 +53,16 @@ def ray_row(
 
 
 def cavity_rows(albedos: tuple[float, ...]) -> list[Row]:
-    """A lamp in the middle of a closed ball: a / (1 - a) times the direct light."""
+    """A lamp in the middle of a closed ball: a / (1 - a) times the direct light.
+
+    That is what its walls get on average, all that the lamp sends out over their area.
+    """
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
     points, normals = samples(ball, 64)
     lamp = PointLight(np.zeros(3, np.float32), np.ones(3, np.float32))
-    rows = []
+    direct, rows = 4 * np.pi / ball.area, []
     for albedo in albedos:
         scene = light_scene(mesh_of(ball), np.full((1, 3), albedo), lamp)
-        direct = direct_irradiance(scene, points, -normals, samples=1, seed=0).mean()
         rows.append(
             ray_row(
                 "indirect light",
@@ -68,7 +70,7 @@ def cavity_rows(albedos: tuple[float, ...]) -> list[Row]:
                 lambda scene=scene: indirect_irradiance(
                     scene, points, -normals, paths=64, seed=0
                 ),
-                float(direct) * albedo / (1 - albedo),
+                direct * albedo / (1 - albedo),
             )
         )
     return rows

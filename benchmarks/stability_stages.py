@@ -40,7 +40,7 @@ def error(found: Any, exact: Any) -> tuple[float, int]:
     worst, bad = 0.0, 0
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(exact), strict=True):
         a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
-        finite = np.isfinite(a)
+        finite = np.isfinite(a) & np.isfinite(b)
         bad += int((~finite).sum())
         if finite.any() and (gap := np.abs(a - b)[finite].max()) > 0:
             worst = max(worst, float(gap / max(np.abs(b[finite]).max(), 1e-300)))

@@ -95,8 +95,7 @@ def main(options: Options) -> dict[str, Any]:
 
     config = training(options, network, options.points, len(clouds))
     extra = {"data": asdict(settings), "objects": [s.name for s in train_sources]}
-    run = train(console, config, clouds, options, extra)
-    clock.parts |= run.seconds
+    run = train(console, config, clouds, options, extra, clock)
 
     begin = time.perf_counter()
     metrics = evaluation(options, run, config, unseen, test_sources, clouds)

@@ -89,7 +89,7 @@ rays or paths a pixel. Networks are given {m["samples"]} samples of a frame.
 Flicker is the mean squared change from frame to frame that the reference does not have,
 over pixels seen in both; error and flicker are in units of the squared mean of the
 reference, its noise subtracted. Samples of the object move with their faces, and levels
-keep those that they kept; "frame by frame" they are drawn anew.
+keep those that they kept; "frame by frame" they do not, though lots stay the same.
 
 {report.table_of(m["flicker"], columns)}
 {_table_of_sequences(found) if several else ""}

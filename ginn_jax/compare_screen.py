@@ -1,7 +1,7 @@
 """What screen-space methods make of a shot."""
 
 from collections.abc import Callable
-from functools import cache, partial
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
@@ -34,7 +34,8 @@ def screen_pictures(
     return found
 
 
-@cache
+# Enough for the views of a scene; what they hold of memory maps is let go with them.
+@lru_cache(maxsize=64)
 def compiled_screen(
     method: Callable, static: tuple[tuple[str, Any], ...], shapes: tuple
 ) -> Any:

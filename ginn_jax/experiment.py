@@ -25,7 +25,7 @@ from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Row, pool_rows
 from ginn_jax.lit_clouds import Cloud
 from ginn_jax.objects import SEEDS_APART, UNSEEN_SEED, Source
-from ginn_jax.pretrained import load_any, starting_weights
+from ginn_jax.pretrained import load_any, run_folder, starting_weights
 from ginn_jax.process import available_cores, forget_programs
 from ginn_jax.recipe import Training
 from ginn_jax.upsample import shading_step
@@ -81,6 +81,12 @@ def check_run(options: RunOptions, least: dict[str, int]) -> None:
     require_positive(options, "learning_rate", "disk")
     positive("--sparsest", options.sparsest, 1.0)
     if options.start is not None:
+        run = run_folder(options.start)
+        if run is not None and run.resolve() == options.out.resolve():
+            raise InputError(
+                f"--start {run} is the --out, where a new run removes what it finds: "
+                "give another --out"
+            )
         load_any(options.start)  # a name that is wrong is said before data are made
     if max(options.shapes, 30) + options.seed * SEEDS_APART > UNSEEN_SEED:
         raise InputError(
@@ -115,7 +121,13 @@ def make(
     settings: scenes.Settings,
     folder: Path,
 ) -> list[Any]:
-    """Make, or find, the clouds of all sources."""
+    """Make, or find, the clouds of all sources.
+
+    Raises:
+        InputError: no sources.
+    """
+    if not sources:
+        raise InputError(f"no {what}: ask for at least one shape")
     workers = min(available_cores(), 8)
     with bar(console) as progress:
         task = progress.add_task(what, total=len(sources), note="")
@@ -141,6 +153,7 @@ def train(
     clouds: Sequence[Cloud],
     options: RunOptions,
     extra: dict[str, Any],
+    clock: Clock,
 ) -> fit.Fit:
     """`fit.fit` with a progress bar, or a line every 100 steps where none can be.
 
@@ -162,7 +175,8 @@ def train(
                 console.print(f"step {step} of {config.steps}: {text}")
 
         given = config, clouds, options.out, fit.Intervals(), tell, options.resume
-        run = fit.fit(*given, extra, weights)
+        run = fit.fit(*given, extra, weights, clock.parts)
+    clock.parts = run.seconds
     forget_programs()
     return run
 

@@ -3,7 +3,7 @@
 import io
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -71,11 +71,13 @@ def fit(
     resume: bool = False,
     extra: dict[str, Any] | None = None,
     weights: Variables | None = None,
+    spent: Mapping[str, float] | None = None,
 ) -> Fit:
     """Train to `config.steps` from `weights` or random ones, saving under `folder`.
 
     Where a batch needs more than there is room for, more is made and the step repeated,
     on the state it started from. `progress(step, loss, note)` hears of every report.
+    `spent` are seconds that went into the clouds, which the run's record keeps.
 
     Raises:
         InputError: clouds of too few points or of unequal size, or nothing to resume.
@@ -87,8 +89,12 @@ def fit(
         room, seconds, raised = load_run(folder, config, extra)
     else:
         room, seconds, raised = training_room(config, clouds), dict(UNSPENT), {}
-        save_run(folder, config, room, extra, seconds)
+    for purpose, more in (spent or {}).items():
+        seconds[purpose] = seconds.get(purpose, 0.0) + more
+    # No record may stand beside another run's checkpoints, wherever this is killed.
     manager = open_manager(folder, fresh=not resume)
+    if not resume:
+        save_run(folder, config, room, extra, seconds)
     found = latest(manager, config, folder) if resume else None
     state, history = found or (init_state(config, weights), [])
     seconds["compile"] += time.perf_counter() - begin

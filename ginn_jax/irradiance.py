@@ -29,7 +29,7 @@ LATTICE = (0.7548776662466927, 0.5698402909980532)
 # After EARLIEST bounces the integrator ends paths, each with a chance of 1 - KEEPING or
 # more. Where more light than KEEPING comes back the weight of the others would grow
 # without end, and the variance: there all but DARK has to be absorbed first.
-KEEPING, EARLIEST, LATEST, DARK = 0.95, 5, 10_000, 1e-3
+KEEPING, EARLIEST, LATEST, DARK = 0.95, 5, 10_000, 1e-4
 
 
 class LitScene(NamedTuple):

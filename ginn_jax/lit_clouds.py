@@ -121,7 +121,8 @@ def save_lit_cloud(path: Path, cloud: LitCloud, origin: dict[str, Any]) -> None:
         "material": cloud.material.astype(np.uint8),
     }
     for name in LIGHTS:
-        unit = max(float(np.mean(arrays[name], dtype=np.float64)), 1e-30)
+        most = float(arrays[name].max(initial=0.0)) / LARGEST_HALF
+        unit = max(float(np.mean(arrays[name], dtype=np.float64)), most, 1e-30)
         arrays[f"{name}_unit"] = np.float64(unit)
         arrays[name] = np.minimum(arrays[name] / unit, LARGEST_HALF).astype(np.float16)
     save_arrays(path, arrays, origin)

@@ -62,8 +62,7 @@ def run_experiment(
 
     config = training(options, network, settings.points, len(clouds))
     extra = {"data": asdict(settings), "objects": [s.name for s in seen]}
-    run = train(console, config, clouds, options, extra)
-    clock.parts |= run.seconds
+    run = train(console, config, clouds, options, extra, clock)
 
     begin = time.perf_counter()
     floor = unit_floor(clouds)

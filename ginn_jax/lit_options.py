@@ -63,7 +63,8 @@ def choose_sources(
     seed, each = options.seed, options.lights
     objects = procedural_sources(options.shapes, seed * SEEDS_APART)
     objects += _files(options.meshes, find_meshes, file_sources)
-    lights = procedural_lights(max(options.shapes, 30), seed * SEEDS_APART)
+    count = max(options.shapes, each, 30)
+    lights = procedural_lights(count, seed * SEEDS_APART)
     maps = _files(options.envmaps, find_environments, file_lights)
     if options.split == "paper":
         return paper_sources(options, objects, maps + lights[: max(30 - len(maps), 0)])

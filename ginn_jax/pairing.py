@@ -57,10 +57,18 @@ def spread(items: Sequence[T], count: int) -> list[T]:
 def pair_up(
     objects: Sequence[Source], lights: Sequence[LightSource], each: int
 ) -> list[Source]:
-    """Every object under `each` of the lights, in turns, so that all are used."""
+    """Every object under `each` of the lights, in turns, so that all are used.
+
+    Raises:
+        InputError: fewer lights than that.
+    """
     if not lights:
         raise InputError("no lights: give environment maps, or ask for procedural ones")
-    each = min(whole("lights for each object", each, 1, LARGEST_SEED), len(lights))
+    each = whole("lights for each object", each, 1, LARGEST_SEED)
+    if each > len(lights):
+        raise InputError(
+            f"{each} lights for each object, there are {len(lights)}: ask for fewer"
+        )
     pairs = []
     for i, source in enumerate(objects):
         for k in range(each):

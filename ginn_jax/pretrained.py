@@ -85,26 +85,30 @@ def starting_weights(name: str, config: Training) -> Variables:
 
 
 def load_network(effect: str, name: str | None) -> tuple[Training, Limits, Variables]:
-    """`load_any` of an effect; for None the network that is named as the effect.
+    """`load_any` of an effect; for None the package's that is named as the effect.
 
     Raises:
         InputError: as `load_any`, or a network of another effect.
     """
-    name = name or effect
-    found = load_any(name)
+    found = load_any(name or effect)
     if effect_of(found[0].network) != effect:
         raise InputError(f"{name} is no network of {effect}: name one that is")
     return found
 
 
 def load_any(name: str) -> tuple[Training, Limits, Variables]:
-    """The network of a run, if `name` is a path or a folder, else `load_pretrained`."""
+    """The network of a run, if `name` is a folder's, else `load_pretrained`."""
     run = run_folder(name)
     return load_pretrained(name) if run is None else load_weights(run)
 
 
 def run_folder(name: str) -> Path | None:
-    """The folder of the run that is meant; None for a network of the package."""
+    """The folder of the run that is meant; None for a network of the package.
+
+    A name of both is the package's: the folder "gi" is "./gi".
+    """
+    if name in load_manifest():
+        return None
     run = Path(name)
     return run if run.is_dir() or len(run.parts) > 1 else None
 

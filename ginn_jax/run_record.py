@@ -61,7 +61,7 @@ def load_run(
         training = dict(record["training"])
         room = Room(limits_from(record, "usual"), limits_from(record))
         spent = record.get("seconds", UNSPENT)
-        seconds = {name: float(spent[name]) for name in UNSPENT}
+        seconds = UNSPENT | {name: float(spent[name]) for name in spent}
         raised = {name: int(n) for name, n in record.get("raised", {}).items()}
     wanted = json.loads(json.dumps({"training": asdict(config), **extra}))
     for name in sorted(wanted["training"]):

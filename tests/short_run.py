@@ -23,7 +23,7 @@ def cloud(seed, light=1.0):
     return made._replace(target=made.target * shine, light=shine[:, None])
 
 
-def train(folder, clouds, resume=False, progress=lambda *_: None, weights=None):
+def train(folder, clouds, resume=False, progress=lambda *_: None, **more):
     given = CONFIG, clouds, folder, OFTEN, progress, resume
     with tiny.cheap_compiling(), jax.numpy_dtype_promotion("standard"):
-        return fit.fit(*given, weights=weights)
+        return fit.fit(*given, **more)

@@ -217,9 +217,10 @@ def test_a_run_that_is_refused_keeps_its_results(recorded):
         path.write_text("of its weights")
     options = experiment.RunOptions(out=recorded, resume=True)
     clouds = [tiny.sphere_on_plane(CONFIG.points, seed) for seed in range(2)]
+    clock = experiment.Clock()
     for config, given in ((CONFIG, []), (replace(CONFIG, steps=1), clouds)):
         with pytest.raises(InputError):
-            experiment.train(Console(), config, given, options, EXTRA)
+            experiment.train(Console(), config, given, options, EXTRA, clock)
     assert [path.read_text() for path in results] == ["of its weights"] * 2
 
 

@@ -79,6 +79,7 @@ def test_mistakes_end_in_one_line_and_code_2(tmp_path):
         {"radius": float("nan")},
         {"radius": -1.0},
         {"start": "no_such_run"},
+        {"start": "runs/one", "out": Path("runs/one")},
     ],
 )
 def test_options_that_cannot_be_meant_are_refused(wrong):
@@ -105,6 +106,12 @@ def test_a_small_run_leaves_all_that_is_promised(tmp_path, monkeypatch):
     text = (tmp_path / "report.md").read_text()
     assert "unseen shapes | 2 |" in text
     assert "rays of equal MSE" in text
+
+
+def test_nothing_to_train_on_is_said_before_data_are_made(tmp_path):
+    with pytest.raises(InputError, match="no training clouds: ask for at least one"):
+        ao_train.main(replace(SMALL, shapes=0, out=tmp_path))
+    assert not list(tmp_path.rglob("*.npz"))
 
 
 def test_pace_of_a_resumed_run_is_its_own():

@@ -59,6 +59,22 @@ def test_weights_that_are_given_are_trained_on(tmp_path, monkeypatch):
     np.testing.assert_array_equal(values, values[0])
 
 
+def test_no_record_stands_beside_the_checkpoints_of_another_run(tmp_path, monkeypatch):
+    """A run that begins anew is stopped while it removes those of the one before."""
+    stand_in(monkeypatch.setattr)
+    train(tmp_path, [cloud(0)], spent={"data": 5.0})
+    before = json.loads((tmp_path / run_record.RECORD).read_text())
+    assert before["seconds"]["data"] == 5
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(checkpoint.shutil, "rmtree", stop)
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path, [cloud(0)], spent={"data": 6.0})
+    assert json.loads((tmp_path / run_record.RECORD).read_text()) == before
+
+
 class Killer:
     """SIGKILL at the `moment`-th of the calls that a run makes of some functions."""
 
@@ -181,10 +197,13 @@ def test_time_spent_before_counts(unbroken):
     path = folder / run_record.RECORD
     record = json.loads(path.read_text())
     assert record["seconds"]["train"] > 0
-    path.write_text(json.dumps(record | {"seconds": {"compile": 1e6, "train": 2e6}}))
-    found = train(folder, [cloud(seed) for seed in range(3)], True)
+    spent = {"compile": 1e6, "train": 2e6, "data": 3e6}
+    path.write_text(json.dumps(record | {"seconds": spent}))
+    clouds = [cloud(seed) for seed in range(3)]
+    found = train(folder, clouds, True, spent={"data": 10.0})
     assert found.seconds["train"] == 2e6
     assert found.seconds["compile"] > 1e6
+    assert found.seconds["data"] == 3e6 + 10
 
 
 def test_part_of_a_checkpoint_is_ignored_or_named(unbroken):

@@ -128,6 +128,14 @@ def test_suns_beside_dim_points_survive(tmp_path, suns):
     np.testing.assert_allclose(found.target, alone, rtol=1e-3)
 
 
+def test_a_firefly_among_many_points_survives(tmp_path):
+    """All of the light in one of 90,000 numbers is more than a half-precision one."""
+    alone = np.zeros((30_000, 3), np.float32)
+    alone[7, 1] = 3.0
+    found = again(tmp_path, cloud_of(30_000)._replace(variance=alone))
+    np.testing.assert_allclose(found.variance, alone, rtol=1e-3)
+
+
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
 def test_light_of_any_scale_survives(tmp_path, scale):
     cloud = cloud_of(500)

@@ -165,8 +165,11 @@ def test_every_object_has_lights_and_every_light_objects(
     else:
         things = procedural_sources(count, 100)
     lights = LIGHTS[kind](some, 50)
+    if each > some:
+        with pytest.raises(InputError, match=f"^{each} lights .* there are {some}:"):
+            pair_up(things, lights, each)
+        each = some
     pairs = pair_up(things, lights, each)
-    each = min(each, some)
     assert len(pairs) == count * each
     assert len({p.name for p in pairs}) == len(pairs)
     assert len({p.seed for p in pairs}) == len(pairs)

@@ -4,6 +4,7 @@ import json
 import shutil
 from contextlib import nullcontext
 from functools import cache
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -193,3 +194,15 @@ def test_the_error_on_the_fixed_scene_is_the_stored_one(name):
         error = export.fixed_scene_error(*given, Model(weights, jax.random.key(0)))
     stored = MANIFEST[name]["fixed_scene_relative_mse_3d"]
     assert error == pytest.approx(stored, rel=0.05)
+
+
+def test_a_folder_does_not_stand_in_for_a_network_of_the_package(tmp_path, monkeypatch):
+    """As `--out gi` leaves one: who wants that says so."""
+    (tmp_path / "gi").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert pretrained.run_folder("gi") is None
+    assert pretrained.run_folder("./gi") == Path("gi")
+    config, _, _ = pretrained.load_network("gi", None)
+    assert presets.effect_of(config.network) == "gi"
+    with pytest.raises(InputError, match="gi holds no run"):
+        pretrained.load_network("gi", "./gi")

@@ -1,6 +1,7 @@
 import signal
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import trimesh
 
 from ginn_jax import objects, scenes, visible
 from ginn_jax.dataset import load_cloud
-from ginn_jax.errors import InputError
+from ginn_jax.errors import InputError, InputWarning
 from ginn_jax.mesh import add_ground, make_mesh
 from ginn_jax.reference import ambient_occlusion, build_scene
 from ginn_jax.shapes import random_shape
@@ -290,3 +291,23 @@ def test_a_scene_that_is_sealed_is_refused(tmp_path):
     scene = nested_boxes(tmp_path / "many.ply", np.linspace(1, 0.9, 200))
     with pytest.raises(InputError, match=r"^[^\n]*sealed[^\n]*$"):
         visible_samples(scene, 100, seed=0)
+
+
+def test_what_is_wrong_with_an_object_names_it(sources, tmp_path, monkeypatch):
+    """What worker processes say has to tell one of many files."""
+
+    def fail(*_):
+        raise InputError("all is sealed: mend it")
+
+    monkeypatch.setattr(scenes, "visible_samples", fail)
+    with pytest.raises(InputError, match=r"^crate: all is sealed: mend it$"):
+        scenes.make_cloud(sources[0], SETTINGS, tmp_path / "cloud.npz")
+    leaks = InputWarning("a tenth leaks")
+    with pytest.warns(InputWarning, match="^crate: a tenth"), scenes.naming(sources[0]):
+        warnings.warn(leaks, stacklevel=1)
+    named = InputError("crate is empty")
+    with (
+        pytest.raises(InputError, match=r"^crate is empty$"),
+        scenes.naming(sources[0]),
+    ):
+        raise named
