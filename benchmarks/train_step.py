@@ -172,18 +172,17 @@ def make_batch(options: Options, config: Training) -> tuple[ShadedPoints, Limits
 
 
 def main(options: Options) -> dict[str, Any]:
-    """Profile a device's share and the whole step; returns what metrics.json holds."""
+    """Profile one cloud and the whole step; returns what metrics.json holds."""
     require(options, {"shapes": 1, "batch": 1, "points": 500, "queries": 1})
     require(options, {"repeats": 1})
     begin = time.perf_counter()
     sizes = options.batch, options.points, options.queries
     config = Training(presets.PRESETS[options.preset], 1000, *sizes)
     batch, limits = make_batch(options, config)
-    share = config.batch_size // batch_mesh(config.batch_size).size
-    small = jax.tree.map(lambda a: a[:share], batch)
-    single = replace(config, batch_size=share)
-    columns = {"one device's share": profile(single, limits, small, options.repeats)}
-    if share < config.batch_size and not options.quick:
+    small = jax.tree.map(lambda a: a[:1], batch)
+    single = replace(config, batch_size=1)
+    columns = {"one cloud": profile(single, limits, small, options.repeats)}
+    if config.batch_size > 1 and not options.quick:
         columns["whole step"] = profile(config, limits, batch, options.repeats)
     metrics = {
         "columns": columns,

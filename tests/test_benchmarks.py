@@ -53,7 +53,7 @@ def test_train_step(tmp_path, monkeypatch):
     monkeypatch.setattr(train_step, "train_step", step_of_ones(train_step.train_step))
     with jax.numpy_dtype_promotion("standard"), tiny.cheap_compiling():
         metrics = train_step.main(options)
-    assert list(metrics["columns"]["one device's share"]["added"]) == list(stages)
+    assert list(metrics["columns"]["one cloud"]["added"]) == list(stages)
     assert "a third of" in (tmp_path / "report.md").read_text()
     check_files(tmp_path, "train_step.png")
 
