@@ -77,7 +77,7 @@ class Unseen(NamedTuple):
     """Objects of one kind that no network trained on, and their clouds."""
 
     sources: Sequence[objects.Source]
-    clouds: list[ShadedPoints]
+    clouds: Sequence[ShadedPoints]
 
 
 def variants(network: Network) -> dict[str, Network]:
@@ -103,7 +103,7 @@ def compare(
     options: Options,
     run: experiment.RunOptions,
     network: Network,
-    clouds: list[ShadedPoints],
+    clouds: Sequence[ShadedPoints],
     tests: dict[str, Unseen],
 ) -> dict[str, Any]:
     """Errors and times of one network after its training."""
@@ -138,7 +138,7 @@ def image_times(
 
 def make_clouds(
     console: Console, options: Options
-) -> tuple[list[ShadedPoints], dict[str, Unseen]]:
+) -> tuple[Sequence[ShadedPoints], dict[str, Unseen]]:
     """Clouds to train on and unseen ones."""
     settings = scenes.Occlusion(options.points, options.rays)
     exact = scenes.Occlusion(options.points, EXACT_RAYS)

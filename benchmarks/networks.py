@@ -70,7 +70,7 @@ class Options:
 QUICK = {"seconds": 1e-3, "shapes": 2, "test_shapes": 1, "points": 2000, "paths": 2}
 QUICK |= {"resolution": 48}
 
-Scenes = dict[str, tuple[Sequence[Source], list[LitCloud]]]
+Scenes = dict[str, tuple[Sequence[Source], Sequence[LitCloud]]]
 
 
 def main(options: Options) -> dict[str, Any]:
@@ -110,7 +110,7 @@ def compare(
     options: Options,
     run: LitOptions,
     network: Network,
-    clouds: list[LitCloud],
+    clouds: Sequence[LitCloud],
     tests: Scenes,
     settings: LitSettings,
 ) -> dict[str, Any]:
@@ -150,7 +150,7 @@ def errors_and_times(
     return found | {f"image {part}": row[part] for part in parts}
 
 
-def step_seconds(config: Training, clouds: list[LitCloud]) -> float:
+def step_seconds(config: Training, clouds: Sequence[LitCloud]) -> float:
     """Seconds of a step, of compiled ones that needed no more room."""
     room, state = training_room(config, clouds), init_state(config)
     compiled, seconds = set[Limits](), list[float]()

@@ -7,6 +7,7 @@ shapes that training never saw. `--help` lists every option with its default.
 """
 
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -133,9 +134,9 @@ def evaluation(
     options: Options,
     run: fit.Fit,
     config: Training,
-    unseen: list[scenes.ShadedPoints],
+    unseen: Sequence[scenes.ShadedPoints],
     sources: list[objects.Source],
-    clouds: list[scenes.ShadedPoints],
+    clouds: Sequence[scenes.ShadedPoints],
 ) -> dict[str, Any]:
     """All errors of the trained network; draws the figures."""
     variables = jax.device_put(run.state.variables, jax.devices()[0])

@@ -47,7 +47,7 @@ def first_samples(cloud: Cloud, share: float) -> Cloud:
 
 def errors_at_points(
     networks: dict[str, Trained],
-    clouds: list[Any],
+    clouds: Sequence[Any],
     sources: list[Source],
     settings: Settings,
 ) -> tuple[dict[str, Row], dict[str, Trained]]:
@@ -60,7 +60,7 @@ def errors_at_points(
 
 
 def rows_at_points(
-    trained: Trained, clouds: list[Any], sources: list[Source], settings: Settings
+    trained: Trained, clouds: Sequence[Any], sources: list[Source], settings: Settings
 ) -> tuple[list[Row], Trained]:
     """3D errors on every cloud, and the network with the limits it took."""
     network, limits, model = trained

@@ -120,7 +120,7 @@ def make(
     sources: Sequence[Source],
     settings: scenes.Settings,
     folder: Path,
-) -> list[Any]:
+) -> Sequence[Any]:
     """Make, or find, the clouds of all sources.
 
     Raises:

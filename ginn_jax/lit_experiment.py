@@ -90,7 +90,7 @@ def evaluation(
     config: Training,
     settings: LitSettings,
     unseen: dict[str, list[Source]],
-    clouds: dict[str, list[LitCloud]],
+    clouds: dict[str, Sequence[LitCloud]],
 ) -> dict[str, Any]:
     """All errors of the trained network; draws the figures."""
     variables = jax.device_put(run.state.variables, jax.devices()[0])

@@ -9,6 +9,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ginn_jax.dataset import ShadedPoints, load_cloud, save_cloud
 from ginn_jax.errors import InputError, InputWarning
 from ginn_jax.lit_clouds import Cloud, load_lit_cloud, save_lit_cloud
@@ -23,6 +25,7 @@ from ginn_jax.visible import visible_samples
 # which a pool may wait forever for a process that it does not start (python/cpython
 # #115634).
 SCENES_PER_WORKER = 200
+IN_MEMORY = 4 << 30  # bytes
 # Raised where an effect's ground truth becomes another, so that what was made is not
 # taken for it.
 FORMATS = {"occlusion": 5, "illumination": 6, "scattering": 7}
@@ -154,8 +157,29 @@ def cloud_path(folder: Path, source: Source) -> Path:
     return folder / f"{source.name}.npz"
 
 
+class OnDisk(Sequence[Any]):
+    """Clouds that stay in their files, each read whenever it is asked for."""
+
+    def __init__(
+        self, sources: Sequence[Source], settings: Settings, folder: Path
+    ) -> None:
+        self.sources, self.settings, self.folder = sources, settings, folder
+
+    def __len__(self) -> int:
+        return len(self.sources)
+
+    def __getitem__(self, index: Any) -> Any:
+        source = self.sources[index]
+        return read_cloud(source, self.settings, cloud_path(self.folder, source))
+
+
 def read_clouds(
     sources: Sequence[Source], settings: Settings, folder: Path
-) -> list[Any]:
-    """The clouds that `make_clouds` made, in the order of the sources."""
-    return [read_cloud(s, settings, cloud_path(folder, s)) for s in sources]
+) -> Sequence[Any]:
+    """The clouds that `make_clouds` made, in the order of the sources; those of a large
+    set, as of the paper's 20,000, are not held in memory."""
+    clouds = OnDisk(sources, settings, folder)
+    if not clouds:
+        return []
+    each = sum(np.asarray(array).nbytes for array in clouds[0])
+    return list(clouds) if each * len(clouds) <= IN_MEMORY else clouds

@@ -91,6 +91,17 @@ def test_cloud_has_samples_of_the_scene(sources, made):
         assert len(np.unique(cloud.position, axis=0)) == 300
 
 
+def test_many_clouds_stay_in_their_files(sources, made, monkeypatch):
+    held = scenes.read_clouds(sources, SETTINGS, made)
+    assert isinstance(held, list)
+    monkeypatch.setattr(scenes, "IN_MEMORY", 2 * 300 * 4 * 8 - 1)
+    read = scenes.read_clouds(sources, SETTINGS, made)
+    assert not isinstance(read, list)
+    assert tiny.identical(list(read), held)
+    assert tiny.identical(read[np.int64(1)], held[1])
+    assert read[0] is not read[0]
+
+
 def test_second_making_is_the_same(sources, made, tmp_path):
     path = scenes.cloud_path(tmp_path, sources[1])
     scenes.make_cloud(sources[1], SETTINGS, path)
