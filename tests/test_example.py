@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import short_run
 import tiny
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ginn_jax import example, train
+from ginn_jax import dataset, example, train
 from ginn_jax.geometry import Geometry
 from ginn_jax.objective import init_variables
 from ginn_jax.receptive_field import Oriented
@@ -97,3 +98,16 @@ def test_shares_are_between_the_sparsest_and_all():
     assert 0.18 < counts.min() < 0.25
     assert 0.95 < counts.max() <= 1
     assert abs(counts.mean() - 0.6) < 0.08
+
+
+@given(st.floats(1e-3, 1e5), st.floats(1e-3, 1e5))
+def test_targets_are_in_units_of_their_own_clouds_light(one, two):
+    batch = dataset.stack_clouds([short_run.cloud(0, one), short_run.cloud(1, two)])
+    made = in_units_of_light(batch)
+    for i in range(2):
+        plain = tiny.sphere_on_plane(short_run.POINTS, i)
+        np.testing.assert_allclose(made.target[i], plain.target, rtol=1e-4)
+        np.testing.assert_allclose(made.light[i], 1, rtol=1e-4)
+
+
+in_units_of_light = jax.jit(jax.vmap(example.in_unit_light))

@@ -27,7 +27,7 @@ from ginn_jax import limits as lm
 from ginn_jax import searches as se
 from ginn_jax.architecture import Network
 from ginn_jax.packets import Demand, Edges
-from ginn_jax.presets import released_table
+from ginn_jax.presets import only_2d, released_table
 
 pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
@@ -219,3 +219,11 @@ def test_levels_are_of_the_same_points_however_they_are_sorted(seed):
     for level in range(len(LEVELS)):
         assert points(one, level) == points(two, level)
         assert points(one, level) != points(other, level)
+
+
+def test_a_network_without_f_3d_finds_the_same_areas(surface):
+    flat = only_2d(surface[0])
+    built = as_numpy(jitted(flat, generous(flat), CLOUD, QUERIES))
+    geometry, _, demands = built
+    assert lm.exceeded(generous(flat), as_jax(demands)) == {}
+    np.testing.assert_allclose(geometry.area, surface[1].area, rtol=1e-5)

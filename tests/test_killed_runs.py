@@ -75,6 +75,15 @@ def test_no_record_stands_beside_the_checkpoints_of_another_run(tmp_path, monkey
     assert json.loads((tmp_path / run_record.RECORD).read_text()) == before
 
 
+def test_the_last_state_is_saved_whatever_the_interval(tmp_path, monkeypatch):
+    stand_in(monkeypatch.setattr)
+    monkeypatch.setattr("short_run.OFTEN", fit.Intervals(report=1, save=5))
+    found = train(tmp_path, [cloud(0)])
+    saved = checkpoint.load_weights(tmp_path)[2]
+    assert tiny.identical(saved, jax.device_get(found.state.variables))
+    assert np.isfinite(fit.load_losses(tmp_path, CONFIG.steps)).all()
+
+
 class Killer:
     """SIGKILL at the `moment`-th of the calls that a run makes of some functions."""
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from ginn_jax import fit, room
 from ginn_jax.limits import limits_for, suffices_for
+from ginn_jax.lit_clouds import LitCloud
 
 CONFIG = replace(
     tiny.CONFIG, network=tiny.ONE_LEVEL, points=200, queries=32, steps=6, batch_size=1
@@ -69,3 +70,20 @@ def test_usual_room_is_smaller_and_holds_most(monkeypatch):
     usual, most = dict(found.usual.sizes), dict(found.most.sizes)
     assert all(usual[name] <= most[name] for name in most)
     assert sum(usual.values()) < sum(most.values())
+
+
+def test_every_colour_of_every_cloud_is_trained_on():
+    def made(number):
+        points = tiny.sphere_on_plane(8, 0)
+        color = np.tile(np.float32([1, 2, 3]) + 10 * number, (8, 1))
+        albedo, none = np.ones((1, 3), np.float32), np.zeros(0)
+        known = np.zeros(8, np.int32), color, color, color, albedo, none
+        return LitCloud(*points[:2], *known)
+
+    config, clouds = replace(tiny.CONFIG, batch_size=2), [made(0), made(1)]
+    batches = [fit.step_batch(config, clouds, step) for step in range(60)]
+    found = {float(t) for batch in batches for t in batch.target[:, 0]}
+    assert found == {1, 2, 3, 11, 12, 13}
+    for batch in batches:
+        np.testing.assert_array_equal(batch.light[..., 0], batch.target)
+        np.testing.assert_array_equal(batch.variance, batch.target)

@@ -167,6 +167,7 @@ def test_light_through_a_sheet_is_missed():
     medium = Medium(ALBEDO, 20.0, 1.0)
     truth = subsurface_exitance(lit, medium, *points, paths=64, seed=0)[0].mean
     assert truth.mean() > 0.05
+    assert not light.any()
     assert not scattered(scene, light).any()
 
 

@@ -1,5 +1,6 @@
 """Shading at a lower rate: what upsampling must keep, and where it must say no."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -189,3 +190,24 @@ def test_colours_are_interpolated_each_by_itself(monkeypatch):
         wrong = np.abs(found - 1 - position @ slopes)[mask]
         assert wrong.max() < 0.01 * 0.4 / scale
         assert np.median(wrong) < 1e-6
+
+
+def test_light_stays_with_its_pixels(monkeypatch):
+    """Whatever order they are shaded in: light is linear in the place here."""
+    slopes = np.float32([[1, 2, 3], [0, 0, 0], [3, 1, 2]])
+
+    def shade_points(network, limits, variables, encoded, place, *more):
+        _, material, light, _ = more
+        np.testing.assert_allclose(light[..., 0].T, 1 + place @ slopes, rtol=1e-5)
+        return material[..., 0].T, limits
+
+    monkeypatch.setattr(image, "shade_points", shade_points)
+    network = replace(tiny.ONE_LEVEL, lights=1, materials=1, asks="all")
+    position, normal, _ = plane()
+    mask = np.arange(SIZE)[None] + np.zeros((SIZE, 1)) != 9
+    light = np.moveaxis(1 + position @ slopes, -1, 0)[..., None]
+    codes = Encoded(None, None, None, None, np.ones(3, np.float32))
+    given = network, tiny.LIMITS, {}, codes, position, normal, mask
+    found, _ = image.shade_image(*given, material=2 * light, light=light)
+    expected = 2 + 2 * (position @ slopes)[mask]
+    np.testing.assert_allclose(found[mask], expected, rtol=1e-5)
