@@ -20,6 +20,7 @@ from ginn_jax.mesh_files import load_scene, merge
 GROUND_GAP = 1e-4
 # Clouds on disk number materials by a byte.
 LAST_MATERIAL = 255
+ROUNDED = 1e-5
 
 
 class Mesh(NamedTuple):
@@ -60,7 +61,8 @@ def make_mesh(
 def load_mesh(path: str | Path) -> Mesh:
     """The triangles of any file trimesh reads, cleaned by `make_mesh`.
 
-    All parts of a scene are merged into one mesh, each with its transform applied.
+    All parts of a scene are merged into one mesh, each with its transform applied. One
+    that lies so far away that float32 would round its shape is moved, with a warning.
     Raises `InputError` where the file is missing, unreadable or has no triangles.
     """
     scene = load_scene(Path(path))
@@ -72,7 +74,7 @@ def load_mesh(path: str | Path) -> Mesh:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         try:
-            mesh = make_mesh(merged.vertices, merged.faces)
+            mesh = make_mesh(near_origin(merged.vertices, "mesh"), merged.faces)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
     for warning in caught:
@@ -90,8 +92,13 @@ def find_meshes(path: str | Path) -> list[Path]:
         raise InputError(f"{path}: no such file or folder; give one with meshes")
     if path.is_file():
         return [path]
-    endings = {f".{name}" for name in mesh_formats()}
-    found = sorted(p for p in path.rglob("*") if p.suffix.lower() in endings)
+    # Of .xyz none has triangles, and hidden files are notes of the system's.
+    endings = {f".{name}" for name in mesh_formats()} - {".xyz"}
+    found = sorted(
+        p
+        for p in path.rglob("*")
+        if p.suffix.lower() in endings and not p.name.startswith(".")
+    )
     if not found:
         raise InputError(f"{path}: no mesh in this folder; put .ply, .obj, .glb there")
     return found
@@ -133,8 +140,7 @@ def check_mesh(mesh: Mesh) -> None:
         kind = type(mesh).__name__
         raise InputError(f"mesh is a {kind}: give what load_mesh or make_mesh returns")
     vertices, faces, _ = _checked_arrays(*mesh)
-    edges = np.ptp(vertices[faces], axis=1)
-    if not edges.any():
+    if not area_vectors(vertices[faces].astype(np.float64)).any():
         raise InputError("mesh: all faces have zero area; give triangles with an area")
 
 
@@ -178,6 +184,24 @@ def into_unit_box(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
     if not (extent := (high - low).max()) > 0:
         raise InputError("object: all points coincide; give one with an extent")
     return ((points - (low + high) / 2) / extent).astype(np.float32)
+
+
+def near_origin(
+    points: Float[np.ndarray, "*N 3"], what: str
+) -> Float[np.ndarray, "*N 3"]:
+    """Points as they are, or counted from their middle where float32 would round away
+    more than `ROUNDED` of their extent there, with a warning that says so."""
+    points = np.asarray(points)
+    flat = points.reshape(-1, 3).astype(np.float64)
+    if flat.size == 0 or not np.isfinite(flat).all():
+        return points
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    lost = np.finfo(np.float32).eps * np.abs(flat).max()
+    if not lost > ROUNDED * (high - low).max() > 0:
+        return points
+    middle = np.round((low + high) / 2)
+    _warn(f"{what}: too far away for single precision; moved by {-middle}")
+    return (flat - middle).reshape(points.shape)
 
 
 def area_vectors(corners: Float[np.ndarray, "F 3 3"]) -> Float[np.ndarray, "F 3"]:

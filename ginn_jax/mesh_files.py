@@ -37,6 +37,8 @@ def readable(path: Path) -> Iterator[None]:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         if "charset_normalizer" in reason:  # with which it would guess, were it there
             reason = "no triangles in it: neither binary nor UTF-8 text"
+        if "unexpected length" in reason:
+            reason += " Cut short, or triangles and larger polygons mixed"
         raise InputError(f"{path}: cannot be read ({reason}); export it anew") from None
 
 

@@ -86,7 +86,8 @@ def equal_tracing(
     flat one where what is measured does not grow.
 
     Returns the count and the time at equal MSE, and the ratio of the MSEs, tracing over
-    the method's, at equal time, or at one ray where there is time for less.
+    the method's, at equal time: at one ray where there is time for less, at the most
+    rays measured where the line is flat and there is time.
     """
     if len({count for count, _, _ in traced}) < 2 or not error > 0:
         raise InputError(f"tracing beside MSE {error}: give two counts, an MSE over 0")
@@ -95,7 +96,8 @@ def equal_tracing(
     slope, start = np.polyfit(counts, times, 1)
     if slope <= 0:
         slope, start = 0.0, times.mean()
-    affordable = max((seconds - start) / slope, 1.0) if slope > 0 else 1.0
+    flat = counts[-1] if seconds >= start else 1.0
+    affordable = max((seconds - start) / slope, 1.0) if slope > 0 else flat
     equal = single / error
     return equal, float(start + slope * equal), float(single / affordable / error)
 

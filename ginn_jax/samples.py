@@ -10,7 +10,13 @@ from scipy.spatial import KDTree
 
 from ginn_jax.checks import LARGEST_INDEX, positive, unit_rows, whole
 from ginn_jax.errors import InputError
-from ginn_jax.mesh import Mesh, area_vectors, check_mesh, into_unit_box
+from ginn_jax.mesh import (
+    Mesh,
+    area_vectors,
+    check_mesh,
+    into_unit_box,
+    near_origin,
+)
 from ginn_jax.mesh_files import load_scene, readable
 
 
@@ -25,7 +31,8 @@ class Samples(NamedTuple):
 def load_points(path: str | Path) -> Samples:
     """A PLY point cloud with normals (nx, ny, nz) as samples of material 0.
 
-    Normals are normalised. Raises `InputError` where the file is missing, unreadable,
+    Normals are normalised; points that lie as far away as `load_mesh` says are moved.
+    Raises `InputError` where the file is missing, unreadable,
     a mesh, without normals, or holds non-finite values or zero normals.
     """
     clouds = list(load_scene(Path(path)).geometry.values())
@@ -35,7 +42,8 @@ def load_points(path: str | Path) -> Samples:
         raise InputError(f"{path}: no PLY point cloud in it; save the points as PLY")
     columns = clouds[0].metadata["_ply_raw"]["vertex"]["data"]
     with readable(Path(path)):
-        position = np.asarray(clouds[0].vertices, np.float32).reshape(-1, 3)
+        position = np.asarray(clouds[0].vertices, np.float64).reshape(-1, 3)
+    position = near_origin(position, str(path)).astype(np.float32)
     try:
         normal = np.stack([np.ravel(columns[axis]) for axis in ("nx", "ny", "nz")], -1)
         normal = normal.astype(np.float64)

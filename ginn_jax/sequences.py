@@ -12,7 +12,7 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 
 from ginn_jax.errors import InputError
-from ginn_jax.mesh import Mesh, add_ground, fit_unit_box
+from ginn_jax.mesh import Mesh, add_ground, fit_unit_box, near_origin
 from ginn_jax.orientation import turn_outward
 from ginn_jax.reference import build_scene
 from ginn_jax.samples import Samples
@@ -76,7 +76,8 @@ def load_animation(path: Path) -> Animation:
         raise InputError(f"{path}: vertices are not finite, or faces negative")
     if faces.max() >= vertices.shape[1]:
         raise InputError(f"{path}: a face names a vertex that is not there")
-    return Animation(vertices.astype(np.float32), faces.astype(np.int32))
+    vertices = near_origin(vertices, str(path)).astype(np.float32)
+    return Animation(vertices, faces.astype(np.int32))
 
 
 def procedural_animation(seed: int, frames: int) -> Animation:

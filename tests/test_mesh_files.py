@@ -1,5 +1,6 @@
 """Meshes from files and folders."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from triangles import signed_volume
 
 from ginn_jax import mesh as gm
 from ginn_jax import samples as gs
-from ginn_jax.errors import InputWarning
+from ginn_jax.errors import InputError, InputWarning
 
 ASSETS = Path(__file__).parents[2] / "shared" / "assets" / "meshes"
 
@@ -54,3 +55,47 @@ def test_real_meshes_load_and_sample():
         samples = gs.sample_surface(gm.add_ground(mesh), 2000, seed=0)
         assert np.isfinite(samples.position).all()
         assert set(samples.material) == {0, 1}
+
+
+def test_what_lies_far_away_keeps_its_shape(tmp_path):
+    """Coordinates of a survey: float32 has steps of half a metre there."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=5.0)
+    here = gm.fit_unit_box(gm.make_mesh(ball.vertices, ball.faces))
+    ball.apply_translation([500_000.1, 5_400_000.5, 120])
+    path = tmp_path / "tower.obj"
+    ball.export(path, digits=12)
+    with pytest.warns(InputWarning, match=r"^[^\n]*tower\.obj: mesh: too far away"):
+        there = gm.fit_unit_box(gm.load_mesh(path))
+    np.testing.assert_allclose(there.vertices, here.vertices, atol=1e-6)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        near = ball.vertices - [500_000.1, 5_400_000.5, 20]
+        np.testing.assert_array_equal(gm.near_origin(near, "mesh"), near)
+
+
+def test_notes_of_the_system_and_points_are_no_meshes(tmp_path):
+    box = trimesh.creation.box((1, 1, 1))
+    box.export(tmp_path / "box.ply")
+    (tmp_path / "._box.ply").write_bytes(b"notes")
+    (tmp_path / "scan.xyz").write_text("0 0 0\n")
+    assert gm.find_meshes(tmp_path) == [tmp_path / "box.ply"]
+
+
+def test_triangles_on_a_line_have_no_area():
+    line = np.float32([[0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    mesh = gm.Mesh(line, np.int32([[0, 1, 2]]), np.zeros(1, np.int32))
+    with pytest.raises(InputError, match="all faces have zero area"):
+        gm.check_mesh(mesh)
+
+
+def test_a_binary_file_of_triangles_and_quads_is_explained(tmp_path):
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 5\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz")
+    head += "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    places = np.float32([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0]])
+    faces = b"\x04" + np.int32([0, 1, 2, 3]).tobytes()
+    faces += b"\x03" + np.int32([1, 4, 2]).tobytes()
+    path = tmp_path / "mixed.ply"
+    path.write_bytes(head.encode() + places.tobytes() + faces)
+    with pytest.raises(InputError, match="triangles and larger polygons mixed"):
+        gm.load_mesh(path)

@@ -190,8 +190,13 @@ def test_tracing_at_equal_error_and_at_equal_time(single, start, slope, error):
     assert seconds == pytest.approx(start + slope * single / error, rel=1e-6)
     assert ratio == pytest.approx(single / 8 / error, rel=1e-6)
     shrinking = [(n, e, 9.0 - n / 4) for n, e, _ in traced]
-    flat = metrics.equal_tracing(error, 1.0, shrinking)[1]
-    assert flat == pytest.approx(9.0 - (16 + 1 + 4) / 4 / 3)
+    mean = 9.0 - (16 + 1 + 4) / 4 / 3
+    _, flat, ratio = metrics.equal_tracing(error, mean - 0.1, shrinking)
+    assert flat == pytest.approx(mean)
+    assert ratio == pytest.approx(single / error)
+    # Where there is time for any of them there is time for the most.
+    ratio = metrics.equal_tracing(error, mean + 0.1, shrinking)[2]
+    assert ratio == pytest.approx(single / 16 / error)
     at_once = metrics.equal_tracing(error, 0.0, traced)
     assert at_once[2] == pytest.approx(single / error)
 
