@@ -15,6 +15,8 @@ from conv_cases import (
     VARIANTS,
     assert_close,
     cases,
+    dense_case,
+    field_of,
     make_kernel,
     value,
 )
@@ -26,6 +28,7 @@ from strategies import POINTS, QUERIES, UNIT
 from ginn_jax import kernels
 from ginn_jax import mcconv as mc
 from ginn_jax import receptive_field as rf
+from ginn_jax.network import splat
 
 pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
@@ -188,3 +191,29 @@ def test_tiles_change_nothing(monkeypatch):
         partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5), parts, whole
     )
     assert not np.asarray(parts[1][3])[count:].any()
+
+
+def test_a_splat_is_the_mean_of_what_is_near_and_faces_alike():
+    """Weighed by area, distance and likeness; nothing where nothing is in reach."""
+    case = dense_case()
+    normals, places = (
+        np.float64(a) for a in (case.senders.normal, case.senders.position)
+    )
+    radius, variant = np.float32(case.radius), ("surface", True)
+    field, _ = field_of(case.senders, case.receivers, radius, variant)
+    values = np.random.default_rng(0).normal(size=POINTS).astype(np.float32)
+    found = jax.jit(splat, static_argnums=2)(jnp.asarray(values), field, QUERIES)
+    area = oracles.Surface(places, case.senders.mask, case.radius).share
+    alone = 0
+    for i in range(QUERIES):
+        x, normal = case.receivers.position[i], case.receivers.normal[i]
+        near = case.near(i) if case.receivers.mask[i] else []
+        weights = []
+        for j in near:
+            inside = 1 - (oracles.distance(x, places[j]) / case.radius) ** 2
+            alike = max(normals[j] @ normal, 0) ** 4 + 1e-3
+            weights.append(area[j] * inside**2 * alike)
+        expected = np.average(values[near], weights=weights) if len(near) else 0
+        assert found[i] == pytest.approx(expected, abs=1e-4)
+        alone += not len(near)
+    assert 0 < alone < QUERIES
