@@ -35,8 +35,7 @@ from ginn_jax.commandline import require, require_positive, require_some, start
 from ginn_jax.kernels import Kernel
 from ginn_jax.mcconv import mc_conv
 from ginn_jax.process import ALONE
-from ginn_jax.receptive_field import Field
-from ginn_jax.voxels import morton_order
+from ginn_jax.receptive_field import Field, Oriented, in_coherent_order
 
 TOLERANCE = 1e-4
 ORDERS = "coherent", "random"
@@ -136,10 +135,10 @@ def check(mine: Calls, theirs: Calls) -> float:
     return worst
 
 
-def in_coherent_order(points: np.ndarray) -> np.ndarray:
-    """The points with neighbours together."""
-    everyone = jnp.ones(len(points), bool)
-    return points[np.asarray(morton_order(jnp.asarray(points), everyone))]
+def neighbors_together(points: np.ndarray) -> np.ndarray:
+    """The points in the order in which f_3D has them."""
+    place, everyone = jnp.asarray(points), jnp.ones(len(points), bool)
+    return np.asarray(in_coherent_order(Oriented(place, place, everyone))[0].position)
 
 
 def compare(options: Options, cloud: str, radius: float, order: str) -> dict[str, Any]:
@@ -148,7 +147,7 @@ def compare(options: Options, cloud: str, radius: float, order: str) -> dict[str
     draw = {"uniform": uniform, "surface": surface}[cloud]
     clouds = [draw(rng, options.points) for _ in range(jax.device_count())]
     if order == "coherent":
-        clouds = [in_coherent_order(points) for points in clouds]
+        clouds = [neighbors_together(points) for points in clouds]
     widths = options.channels, options.hidden
     layer = make_layer(clouds, radius, *widths, options.seed)
     mine = ours(layer)

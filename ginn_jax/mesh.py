@@ -14,7 +14,7 @@ from trimesh.exchange.load import mesh_formats
 
 from ginn_jax import orientation
 from ginn_jax.checks import positive, real_array
-from ginn_jax.errors import InputError, InputWarning
+from ginn_jax.errors import InputError, InputWarning, naming
 from ginn_jax.mesh_files import load_scene, merge
 
 GROUND_GAP = 1e-4
@@ -71,15 +71,8 @@ def load_mesh(path: str | Path) -> Mesh:
         if any(isinstance(g, trimesh.PointCloud) for g in scene.geometry.values()):
             raise InputError(f"{path}: a point cloud, no triangles; use load_points")
         raise InputError(f"{path}: no triangles in it; the file is empty or corrupt")
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", InputWarning)
-        try:
-            mesh = make_mesh(near_origin(merged.vertices, "mesh"), merged.faces)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
-    for warning in caught:
-        _warn(f"{path}: {warning.message}")
-    return mesh
+    with naming(str(path)):
+        return make_mesh(near_origin(merged.vertices, "mesh"), merged.faces)
 
 
 def find_meshes(path: str | Path) -> list[Path]:

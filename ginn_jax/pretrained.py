@@ -90,7 +90,8 @@ def load_network(effect: str, name: str | None) -> tuple[Training, Limits, Varia
     Raises:
         InputError: as `load_any`, or a network of another effect.
     """
-    found = load_any(name or effect)
+    name = name or effect
+    found = load_any(name)
     if effect_of(found[0].network) != effect:
         raise InputError(f"{name} is no network of {effect}: name one that is")
     return found

@@ -1,10 +1,8 @@
 """From an object to clouds with ground truth, in worker processes, cached on disk."""
 
 import multiprocessing
-import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ginn_jax.dataset import ShadedPoints, load_cloud, save_cloud
-from ginn_jax.errors import InputError, InputWarning
+from ginn_jax.errors import InputError, naming
 from ginn_jax.lit_clouds import Cloud, load_lit_cloud, save_lit_cloud
 from ginn_jax.lit_scenes import Illumination, Scattering, lit_cloud
 from ginn_jax.mesh import Mesh
@@ -73,30 +71,12 @@ def make_cloud(source: Source, settings: Settings, path: Path) -> None:
         return
     except InputError:
         pass
-    with naming(source):
+    with naming(source.name):
         if isinstance(settings, Occlusion):
             mesh = load_object(source)
             save_cloud(path, occlusion_cloud(mesh, settings, source.seed), origin)
         else:
             save_lit_cloud(path, lit_cloud(source, settings), origin)
-
-
-@contextmanager
-def naming(source: Source) -> Iterator[None]:
-    """Let errors and warnings about an object's input say which object it is."""
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        try:
-            yield
-        except InputError as error:
-            if source.name in str(error):
-                raise
-            raise InputError(f"{source.name}: {error}") from None
-    for warning in told:
-        text = warning.message
-        if isinstance(text, InputWarning) and source.name not in str(text):
-            text = InputWarning(f"{source.name}: {text}")
-        warnings.warn(text, stacklevel=2)
 
 
 def read_cloud(source: Source, settings: Settings, path: Path) -> Cloud:

@@ -83,3 +83,11 @@ def lattice(rows, min_rows=0):
     """Points on a grid of 2^-8, so that moving or doubling them rounds nothing."""
     steps = st.integers(-256, 256).map(lambda k: k / 256)
     return coordinates(steps, min_rows, rows)
+
+
+def unit_rows(rows):
+    """Rows of unit length, up where they are nearly nothing."""
+    rows = rows.astype(np.float64)
+    length = np.linalg.norm(rows, axis=1, keepdims=True)
+    rows = np.where(length < 1e-3, [0, 1, 0], rows / np.maximum(length, 1e-3))
+    return rows.astype(np.float32)

@@ -13,7 +13,6 @@ from ginn_jax import blocks
 
 TWO_DEVICES = """
 import numpy as np
-import pytest
 from dataclasses import replace
 import test_relight as cases
 import tiny

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from strategies import unit_rows
 
 from ginn_jax.dataset import ShadedPoints, load_cloud, save_arrays, save_cloud
 from ginn_jax.errors import InputError
@@ -13,7 +14,6 @@ from ginn_jax.lit_clouds import (
     LIGHTS,
     LitCloud,
     channel_of,
-    from_octahedron,
     load_lit_cloud,
     network_numbers,
     save_lit_cloud,
@@ -26,14 +26,6 @@ DIM = st.floats(0, 4, width=32)
 SUNS = st.sampled_from([0, 1e-3, 1, 1e5])
 ANY = st.floats(width=32, allow_nan=False, allow_infinity=False)
 SHARE = st.floats(0, 1, width=32)
-
-
-def unit_rows(rows):
-    """Rows of unit length, up where they are nearly nothing."""
-    rows = rows.astype(np.float64)
-    length = np.linalg.norm(rows, axis=1, keepdims=True)
-    rows = np.where(length < 1e-3, [0, 1, 0], rows / np.maximum(length, 1e-3))
-    return rows.astype(np.float32)
 
 
 @st.composite
@@ -211,33 +203,6 @@ def test_file_that_lacks_something_is_refused(tmp_path, lacks):
     del fields[lacks]
     save_arrays(path, fields, ORIGIN)
     assert_refused(load_lit_cloud, path, ORIGIN)
-
-
-# Normals
-
-AXES = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
-
-
-def test_axes_are_exact():
-    code = to_octahedron(AXES)
-    assert code.dtype == np.int16
-    assert len(np.unique(code, axis=0)) == 6
-    np.testing.assert_array_equal(from_octahedron(code), AXES)
-
-
-@given(hnp.arrays(np.float32, (20, 3), elements=st.floats(-1, 1, width=32)))
-def test_octahedron_keeps_directions(rows):
-    """Also where it is folded: edges, and components that are zero or tiny."""
-    normals = unit_rows(rows)
-    found = from_octahedron(to_octahedron(normals))
-    assert np.abs(found.astype(float) - normals).max() < 1e-4
-
-
-def test_every_code_is_a_direction_of_its_own():
-    """All of a coarse grid of codes come back, but the corners, which are one point."""
-    grid = np.linspace(-32766, 32766, 81).astype(np.int16)
-    code = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
-    np.testing.assert_allclose(to_octahedron(from_octahedron(code)), code, atol=1)
 
 
 # What the network takes
