@@ -71,6 +71,8 @@ def load_mesh(path: str | Path) -> Mesh:
         if any(isinstance(g, trimesh.PointCloud) for g in scene.geometry.values()):
             raise InputError(f"{path}: a point cloud, no triangles; use load_points")
         raise InputError(f"{path}: no triangles in it; the file is empty or corrupt")
+    if merged.vertices.shape[1:] != (3,):
+        raise InputError(f"{path}: vertices have no three coordinates; export it anew")
     with naming(str(path)):
         return make_mesh(near_origin(merged.vertices, "mesh"), merged.faces)
 

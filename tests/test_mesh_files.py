@@ -99,3 +99,10 @@ def test_a_binary_file_of_triangles_and_quads_is_explained(tmp_path):
     path.write_bytes(head.encode() + places.tobytes() + faces)
     with pytest.raises(InputError, match="triangles and larger polygons mixed"):
         gm.load_mesh(path)
+
+
+def test_vertices_on_a_plane_of_two_axes_are_refused(tmp_path):
+    path = tmp_path / "flat.obj"
+    path.write_text("v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n")
+    with pytest.raises(InputError, match=r"flat\.obj: vertices have no three coord"):
+        gm.load_mesh(path)
