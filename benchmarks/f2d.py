@@ -20,7 +20,7 @@ import numpy as np
 
 from benchmarks.straightforward import shade_plainly
 from benchmarks.timing import Timing, describe, measure, write_cases
-from ginn_jax import blocks, image, inference, objects, reference, report
+from ginn_jax import block_shading, blocks, image, inference, objects, reference, report
 from ginn_jax.architecture import Network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, require_positive, require_some, start
@@ -174,7 +174,7 @@ def block_memory(
     flat = only(limits, network.query.name)
     turn = blocks.turn_shapes(blocks.Turn(queries))
     shared = blocks.everywhere((variables, encoded))
-    lowered = inference.shade_turn.lower(network, flat, on_cpu(), *shared, turn)
+    lowered = block_shading.shade_turn.lower(network, flat, on_cpu(), *shared, turn)
     memory = lowered.compile().memory_analysis()
     return int(memory.temp_size_in_bytes) if memory else 0
 

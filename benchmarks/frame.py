@@ -2,8 +2,8 @@
 
     python -m benchmarks.frame
 
-From samples and a G-buffer in the host's memory to an image there; and f_2D's programs
-alone, from the device's memory to the device's: the rest is NumPy and the way between.
+From samples and a G-buffer in the host's memory to an image there; and the programs of
+f_2D in blocks alone, as a GPU runs it, from the device's memory to the device's.
 """
 
 import time
@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks.paper_tables import PAPER_MS
 from benchmarks.relight import lit_pair, sampled_and_seen
 from benchmarks.timing import describe, measure, write_cases
-from ginn_jax import inference, report
+from ginn_jax import block_shading, inference, report
 from ginn_jax.architecture import Network
 from ginn_jax.blocks import each_its_own, everywhere, make_turns
 from ginn_jax.commandline import require, require_some, start
@@ -106,7 +106,9 @@ def calls_of(
         "f_3D": lambda: encode(limits)[0],
         "f_2D": lambda: shade(limits, encoded)[0],
         "frame": lambda: shade(limits, encode(limits)[0])[0],
-        "f_2D, programs": programs(network, limits, variables, encoded, frame),
+        "f_2D in blocks, programs": programs(
+            network, limits, variables, encoded, frame
+        ),
     }
 
 
@@ -117,7 +119,7 @@ def programs(
     encoded: Encoded,
     frame: Frame,
 ) -> Callable[[], Any]:
-    """f_2D with all that it needs on the devices, and its results left there."""
+    """f_2D in blocks, with all that it needs on the devices and its results there."""
     seen = frame.gbuffer
     surface = Surface(seen.position, seen.normal, seen.mask)
     numbers = numbers_asked(network, *frame.of_pixels)
@@ -125,7 +127,7 @@ def programs(
     turns = make_turns(encoded.scale is not None, encoded.center, *pixels)
     turns = [each_its_own(turn) for turn in turns]
     given = network, everywhere(variables), encoded, turns, coherent, limits
-    return partial(inference.shade_turns, *given)
+    return partial(block_shading.shade_turns, *given)
 
 
 def compare(options: Options, name: str) -> dict[str, Any]:
@@ -172,8 +174,9 @@ def write_report(options: Options, cases: list[dict[str, Any]]) -> str:
     return f"""# Whole frames
 
 {size} x {size}, foreground pixels only; median of {options.repeats} calls ± half the
-interquartile range. f_3D and f_2D from NumPy arrays to NumPy arrays, "programs" with
-all they need on the device and results left there; rendering and light apart.
+interquartile range. f_3D and f_2D from NumPy arrays to NumPy arrays (f_2D in lanes on a
+CPU, in blocks on a GPU); "programs" are f_2D's in blocks with all they need on the
+device and results left there. Rendering and light apart.
 "Compiling" is the time until both had run once in limits that suffice. The paper's
 whole network: 1024 x 1024, NVIDIA GTX 1080.
 

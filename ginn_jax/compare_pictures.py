@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ginn_jax import evaluate, evaluate_light
+from ginn_jax.block_shading import shade_turn
 from ginn_jax.blocks import Turn, largest_block, turn_shapes
 from ginn_jax.compare import Picture, Shot, errors, of_variance, scratch_mib
 from ginn_jax.compare_networks import (
@@ -21,7 +22,8 @@ from ginn_jax.compare_networks import (
 )
 from ginn_jax.dataset import count_given
 from ginn_jax.evaluate import Row, View, at_scale
-from ginn_jax.inference import encode_whole, shade_turn
+from ginn_jax.inference import encode_whole
+from ginn_jax.lane_shading import lanes_for
 from ginn_jax.limits import only, without
 from ginn_jax.lit_clouds import Cloud, LitCloud, mean_light, points_of, split_points
 from ginn_jax.neighbors import bucket
@@ -158,7 +160,8 @@ def codes_kept(row: Row) -> Row:
 def network_memory(trained: Trained, points: int) -> float:
     """Scratch memory of f_3D on so many points and of f_2D on a block on every device.
 
-    What f_3D hands to f_2D is counted, inputs and outputs are not.
+    What f_3D hands to f_2D is counted, inputs and outputs are not. In lanes f_2D keeps
+    little more than a copy of that.
     """
     network, limits, model = trained
 
@@ -177,6 +180,8 @@ def network_memory(trained: Trained, points: int) -> float:
     compiled = encode_whole.lower(*deep, *given).compile()
     encoded, _ = jax.eval_shape(partial(encode_whole, *deep), *given)
     kept = sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(encoded.code))
+    if lanes_for(network):
+        return scratch_mib(compiled) + kept / 2**20
     flat = network, only(limits, network.query.name), on_cpu(), model.variables
     rows = largest_block(encoded.scale is not None)
     turn = turn_shapes(Turn(*shapes(rows, network.asks == "all")))

@@ -11,14 +11,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ginn_jax.architecture import Network
+from ginn_jax.block_shading import shade_blocks
 from ginn_jax.checks import LARGEST, number
 from ginn_jax.dataset import relative_to
 from ginn_jax.errors import InputError
 from ginn_jax.example import numbers_asked
-from ginn_jax.inference import shade_points
+from ginn_jax.inference import check_queries
+from ginn_jax.lane_shading import lanes_for, shade_in_lanes
 from ginn_jax.limits import Limits
 from ginn_jax.network import Variables
 from ginn_jax.process import on_cpu
+from ginn_jax.searches import warn_of_gaps
 from ginn_jax.shading import Encoded
 from ginn_jax.upsample import (
     Surface,
@@ -45,6 +48,12 @@ def pixel_order(height: int, width: int) -> Int[np.ndarray, "P"]:
     return np.argsort(code, axis=None)
 
 
+def pixels_in_rows(mask: Bool[np.ndarray, "H W"]) -> Int[np.ndarray, "M"]:
+    """The pixels in `mask`, neighbours in the image together."""
+    order = pixel_order(*mask.shape)
+    return order[mask.reshape(-1)[order]]
+
+
 def coherent_pixels(
     position: Float[np.ndarray, "H W 3"],
     mask: Bool[np.ndarray, "H W"],
@@ -57,8 +66,7 @@ def coherent_pixels(
     which keeps apart what only the image has side by side; of 32 cells each way, for
     then they begin anew. Sorting 16 bits takes NumPy a pass or two.
     """
-    order = pixel_order(*mask.shape)
-    rows = order[mask.reshape(-1)[order]]
+    rows = pixels_in_rows(mask)
     place = np.asarray(position).reshape(-1, 3).take(rows, axis=0)
     origin = (0.0,) * 3 if center is None else map(float, center)
     code = np.zeros(len(rows), np.int32)
@@ -153,14 +161,46 @@ def _shade_pixels(
     numbers: tuple[Float[np.ndarray, "C H W _"] | None, ...],
 ) -> tuple[Float[np.ndarray, "H W *C"], Limits]:
     """Values of the pixels in the mask; `numbers`: material and light."""
-    ends = network, encoded.center, surface, numbers
-    rows, pixels, coherent = pixels_in_order(*ends)
-    given: tuple[Any, ...] = encoded, *pixels, coherent
-    found, limits = shade_points(network, limits, variables, *given)
     mask = surface.mask
+    if lanes_for(network):
+        rows = pixels_in_rows(mask)
+        found = _shade_rows(network, variables, encoded, surface, numbers, rows)
+    else:
+        ends = network, encoded.center, surface, numbers
+        rows, pixels, coherent = pixels_in_order(*ends)
+        check_queries(network, encoded, *pixels)
+        given: tuple[Any, ...] = encoded, *pixels, coherent
+        found, limits = shade_blocks(network, limits, variables, *given)
     values = np.full((mask.size, *found.shape[1:]), background, np.float32)
     values[rows] = within_range(encoded, found)
     return values.reshape(*mask.shape, *found.shape[1:]), limits
+
+
+def _shade_rows(
+    network: Network,
+    variables: Variables,
+    encoded: Encoded,
+    surface: Surface,
+    numbers: tuple[Float[np.ndarray, "C H W _"] | None, ...],
+    rows: Int[np.ndarray, "M"],
+) -> Float[np.ndarray, "M *C"]:
+    """Values of those pixels, in lanes, which read them where they are."""
+    ends: list[Any] = [np.reshape(a, (-1, 3)) for a in surface[:2]]
+    ends += [
+        a if a is None else np.reshape(a, (len(a), surface.mask.size, -1))
+        for a in numbers
+    ]
+
+    def check(rows: Int[np.ndarray, "M"]) -> None:
+        taken: list[Any] = [None if a is None else a.take(rows, -2) for a in ends]
+        check_queries(network, encoded, *taken)
+
+    check(rows[:0])  # types and shapes
+    shaded = shade_in_lanes(network, variables, encoded, *ends, rows=rows)
+    if shaded.doubtful:
+        check(rows)
+    warn_of_gaps(network.query, shaded.pairs, len(rows))
+    return shaded.values
 
 
 def counted_from(

@@ -1,10 +1,9 @@
 """f_3D of a cloud once, f_2D at any points: on the host, sizing themselves.
 
-Both hold no more than a block of queries at a time, and where a capacity is too small
-they measure what is needed and try again; the limits that sufficed come back for reuse.
+Where a capacity is too small they measure what is needed and try again; the limits that
+sufficed come back for reuse. f_2D in lanes needs none.
 """
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -13,78 +12,30 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from ginn_jax.architecture import Network
-from ginn_jax.blocks import (
-    Turn,
-    block_size,
-    everywhere,
-    for_each_block,
-    in_rows,
-    largest_block,
-    make_turns,
-    pad_channels,
-    pad_points,
-)
+from ginn_jax.block_shading import shade_blocks
+from ginn_jax.blocks import everywhere, pad_channels, pad_points
 from ginn_jax.checks import channels_alike, numbers_of, unit_rows
 from ginn_jax.dataset import center_of
 from ginn_jax.errors import InputError
 from ginn_jax.example import numbers_asked
+from ginn_jax.lane_shading import lanes_for, shade_in_lanes
 from ginn_jax.limits import (
     SLACK,
     Demands,
     Limits,
-    fitted,
     measure_limits,
-    only,
     say_raised,
     with_room,
     without,
 )
 from ginn_jax.neighbors import bucket
 from ginn_jax.network import Variables
-from ginn_jax.process import ALONE
 from ginn_jax.receptive_field import Oriented
 from ginn_jax.searches import uniform_limits, warn_of_gaps
-from ginn_jax.shading import (
-    Encoded,
-    Searched,
-    cloud_demands,
-    encode,
-    query_demands,
-    shade,
-)
+from ginn_jax.shading import Encoded, cloud_demands, encode
 
 encode_whole = jax.jit(encode, static_argnums=(0, 1))
 _cloud_demands = jax.jit(cloud_demands, static_argnums=(0, 1))
-
-
-@partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=ALONE)
-def shade_turn(
-    network: Network,
-    limits: Limits,
-    coherent: bool,
-    variables: Variables,
-    encoded: Encoded,
-    turn: Turn,
-) -> tuple[Float[Array, "D *C R"], Demands]:
-    """`shade` for a block of queries on every device."""
-
-    def shade_block(shared: Any, block: Any) -> tuple[Array, Demands]:
-        return shade(network, limits, *shared, *block, coherent=coherent)
-
-    return for_each_block(shade_block, (variables, encoded), turn)
-
-
-@partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=ALONE)
-def _query_demands(
-    network: Network,
-    limits: Limits,
-    coherent: bool,
-    searched: Searched,
-    turn: Oriented,
-) -> Demands:
-    """`query_demands` of a block of queries on every device."""
-    measure = partial(query_demands, network, limits, coherent=coherent)
-    return for_each_block(measure, searched, turn)
 
 
 def encode_cloud(
@@ -169,38 +120,6 @@ def cloud_limits(
     return measure_limits(ample, probe, 1, SLACK)
 
 
-def query_limits(
-    network: Network,
-    searched: Searched,
-    turns: Sequence[Oriented],
-    coherent: bool = False,
-) -> Limits:
-    """Limits that hold what f_2D of each block needs, measured with ample ones."""
-    ample = uniform_limits(network, 16 * turns[0].mask.shape[1])
-    searched = everywhere(searched)
-
-    def probe(limits: Limits, number: int) -> Demands:
-        given = network, limits, coherent, searched, turns[number]
-        return jax.device_get(_query_demands(*given))
-
-    return measure_limits(only(ample, network.query.name), probe, len(turns), SLACK)
-
-
-def shade_turns(
-    network: Network,
-    variables: Variables,
-    encoded: Encoded,
-    turns: Sequence[Turn],
-    coherent: bool,
-    limits: Limits,
-) -> tuple[list[Array], list[Demands]]:
-    """Values of the blocks of every turn, and their demands; may not be done yet."""
-    needed = {"shader": variables["shader"]}, encoded._replace(center=None, kept=None)
-    given = network, only(limits, network.query.name), coherent, *everywhere(needed)
-    made = [shade_turn(*given, turn) for turn in turns]
-    return [values for values, _ in made], [demands for _, demands in made]
-
-
 def shade_points(
     network: Network,
     limits: Limits,
@@ -210,34 +129,36 @@ def shade_points(
     normal: Float[np.ndarray, "M 3"],
     material: Float[np.ndarray, "C M A"] | None = None,
     light: Float[np.ndarray, "C M L"] | None = None,
-    coherent: bool = False,
 ) -> tuple[Float[np.ndarray, "M *C"], Limits]:
-    """Values at any points, in blocks over all devices; limits for the same again.
+    """Values at any points, in any order; limits for the same again.
 
     With light they have a last axis of channels. `material` and `light` of the points
-    themselves are needed only where the network asks for all. Points that come
-    `coherent`, neighbours together, need not be sorted.
+    themselves are needed only where the network asks for all.
 
     Raises:
         InputError: as `encode_cloud`, but for no points at all, which have no values.
     """
+    check_queries(network, encoded, position, normal, material, light)
+    asked = numbers_asked(network, material, light)
+    ends = variables, encoded, position, normal, *asked
+    if not lanes_for(network):
+        return shade_blocks(network, limits, *ends)
+    shaded = shade_in_lanes(network, *ends)
+    warn_of_gaps(network.query, shaded.pairs, len(position))
+    return shaded.values, limits
+
+
+def check_queries(
+    network: Network,
+    encoded: Encoded,
+    position: Float[np.ndarray, "M 3"],
+    normal: Float[np.ndarray, "M 3"],
+    material: Float[np.ndarray, "C M A"] | None,
+    light: Float[np.ndarray, "C M L"] | None,
+) -> None:
+    """Raise what `shade_points` does."""
     unit_rows(position, normal)
     if network.asks == "all":
         numbers_of("material", material, network.materials, len(position))
         numbers_of("light", light, network.lights, len(position), least=0.0)
         channels_alike(encoded.scale, material, light)
-    lit, asked = encoded.scale is not None, numbers_asked(network, material, light)
-    turns = make_turns(lit, encoded.center, position, normal, *asked)
-    attempt = partial(shade_turns, network, variables, encoded, turns, coherent)
-    queries = [turn.queries for turn in turns]
-    measure = partial(query_limits, network, encoded.searched(), queries, coherent)
-    parts, sufficed, demands = with_room(limits, attempt, measure)
-    size = block_size(len(position), lit)
-    if 2 * size > largest_block(lit):  # the next may be larger
-        sufficed = fitted(sufficed, demands)
-    say_raised(limits, sufficed)
-    warn_of_gaps(network.query, demands, len(position))
-    channels = () if encoded.scale is None else encoded.scale.shape
-    if not parts:
-        return np.zeros((0, *channels), np.float32), sufficed
-    return in_rows(parts)[: len(position)], sufficed

@@ -18,7 +18,7 @@ from ginn_jax.kernels import EXACT, init_kernel
 from ginn_jax.mcconv import apply_stored, mc_conv, mc_conv_mixing, weighted_sum
 from ginn_jax.receptive_field import Field
 
-SLOPE = 0.2
+SLOPE, EPSILON = 0.2, 1e-3
 # What a point weighs in a splat that faces another way: little, but never nothing.
 LEAST_LIKENESS = 1e-3
 # The collection of kernel values that are at hand already, see `relight`.
@@ -36,10 +36,10 @@ class Norm(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "N C"], mask: Bool[Array, "N"]) -> Array:
         if self.kind == "batch":
-            norm = nn.BatchNorm(not self.train, momentum=0.95, epsilon=1e-3)
+            norm = nn.BatchNorm(not self.train, momentum=0.95, epsilon=EPSILON)
             x = norm(x, mask=jnp.broadcast_to(mask[:, None], x.shape))
         elif self.kind == "layer":
-            x = nn.LayerNorm(epsilon=1e-3)(x)
+            x = nn.LayerNorm(epsilon=EPSILON)(x)
         return nn.leaky_relu(x, SLOPE)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from ginn_jax.architecture import Network
+from ginn_jax.block_shading import query_limits
 from ginn_jax.blocks import (
     block_size,
     channels_in_turns,
@@ -25,7 +26,7 @@ from ginn_jax.blocks import (
 from ginn_jax.checks import numbers_of, unit_rows
 from ginn_jax.dataset import center_of
 from ginn_jax.errors import InputError
-from ginn_jax.inference import cloud_limits, query_limits
+from ginn_jax.inference import cloud_limits
 from ginn_jax.limits import (
     Demands,
     Limits,

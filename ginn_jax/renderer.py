@@ -3,6 +3,8 @@
 import ctypes
 import functools
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from ginn_jax import libllvm
@@ -24,25 +26,40 @@ def _cuda_usable() -> bool:
 
 
 @functools.cache
+def use_drjit() -> Any:
+    """Dr.Jit's module, with a libLLVM to compile for the CPU."""
+    if "drjit" not in sys.modules:
+        libllvm.use_libllvm()
+    with _explained():
+        import drjit
+    # The caller may have imported Dr.Jit before, with what it found (-1: nothing).
+    major = drjit.detail.llvm_version()[0]
+    if major < libllvm.OLDEST_LLVM:
+        found = "none usable" if major < 0 else f"LLVM {major}, loaded"
+        raise libllvm.llvm_missing(found)
+    return drjit
+
+
+@functools.cache
 def use_mitsuba() -> tuple[Any, str]:
     """Mitsuba's module and the variant to use: on the GPU if there is a usable one."""
     variant = "cuda_ad_rgb" if _cuda_usable() else "llvm_ad_rgb"
-    if variant == "llvm_ad_rgb" and "drjit" not in sys.modules:
-        libllvm.use_libllvm()
-    try:
-        import drjit
+    if variant == "llvm_ad_rgb":
+        use_drjit()
+    with _explained():
         import mitsuba
+    if mitsuba.variant() is None:  # `variant_context` cannot put back no variant
+        mitsuba.set_variant(variant)
+    return mitsuba, variant
+
+
+@contextmanager
+def _explained() -> Iterator[None]:
+    """Say of a module that cannot be imported what is missing."""
+    try:
+        yield
     except (ImportError, NameError) as error:  # Dr.Jit hides what it misses
         raise InputError(
             f"Mitsuba cannot be loaded ({error.__context__ or error}): install what is "
             "missing, such as `apt-get install libatomic1`"
         ) from error
-    if variant == "llvm_ad_rgb":
-        # The caller may have imported Dr.Jit before, with what it found (-1: nothing).
-        major = drjit.detail.llvm_version()[0]
-        if major < libllvm.OLDEST_LLVM:
-            found = "none usable" if major < 0 else f"LLVM {major}, loaded"
-            raise libllvm.llvm_missing(found)
-    if mitsuba.variant() is None:  # `variant_context` cannot put back no variant
-        mitsuba.set_variant(variant)
-    return mitsuba, variant

@@ -1,10 +1,8 @@
 """Which searches a network makes, and the names of their capacities."""
 
 import warnings
-from collections.abc import Sequence
 
 import jax.numpy as jnp
-import numpy as np
 
 from ginn_jax.architecture import QUERY, Conv, Network, reach
 from ginn_jax.candidates import PACKET
@@ -123,9 +121,8 @@ def transposed(network: Network, conv: Conv) -> str | None:
     return None
 
 
-def warn_of_gaps(conv: Conv, demands: Sequence[Demands], queries: int) -> None:
+def warn_of_gaps(conv: Conv, pairs: int, queries: int) -> None:
     """Warn where queries have hardly a point of the cloud but, maybe, themselves."""
-    pairs = sum(int(np.sum(demand[f"{conv.name}.edges"])) for demand in demands)
     if pairs < 1.5 * queries:
         warnings.warn(
             f"within {conv.radius:g} of a query lie {pairs / queries:.2g} points of "

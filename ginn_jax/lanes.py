@@ -1,0 +1,174 @@
+"""Loops over the points near a query, with a query in every lane of a CPU's vectors.
+
+XLA makes lists of candidates and edges, writes them and reads them again. Here each
+lane goes through the points in the cells around its query and works off those that are
+near: no list, hence no capacity. Dr.Jit, which compiles the ray tracer, compiles it.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ginn_jax.cells import sort_into_cells
+
+# Points near a query that are noted before they are worked off, and numbers of a record
+# that are read at once.
+NOTED, PACKET = 32, 8
+# A query's own column of cells and the eight around it.
+COLUMNS = 9
+
+# A number, or a few, in each lane.
+Lane = Any
+Lanes = list[Any]
+
+
+class Table(NamedTuple):
+    """Points in cells, in Dr.Jit's memory: where each is, and a record of it."""
+
+    place: Any
+    record: Any
+    start: Any
+    low: list[Any]
+    rate: Any
+    shape: list[Any]
+
+
+def make_table(
+    dr: Any,
+    position: Float[np.ndarray, "N 3"],
+    mask: Bool[np.ndarray, "N"],
+    columns: list[Float[np.ndarray, "N _"]],
+    radius: float,
+) -> Table:
+    """The points in `mask`, to be searched within that radius; a record is a row of
+    these columns side by side."""
+    t, rows = dr.llvm, np.flatnonzero(mask)
+    cells = sort_into_cells(position.take(rows, 0), radius)
+    rows = rows[cells.order]
+    return Table(
+        t.Float(_side_by_side([position], rows, 4)),
+        t.Float(_side_by_side(columns, rows, PACKET)),
+        t.UInt32(cells.start),
+        [dr.opaque(t.Float, float(x)) for x in cells.low],
+        dr.opaque(t.Float, float(cells.rate)),
+        [dr.opaque(t.Int32, int(n)) for n in cells.shape],
+    )
+
+
+def _side_by_side(
+    columns: list[Float[np.ndarray, "N _"]], rows: Int[np.ndarray, "M"], packet: int
+) -> Float[np.ndarray, "_"]:
+    """Rows padded to whole packets, from where Dr.Jit can read packets: the start of a
+    cache line."""
+    used = sum(column.shape[1] for column in columns)
+    shape = len(rows), -(-used // packet) * packet
+    size = shape[0] * shape[1]
+    memory = np.zeros(size + 16, np.float32)
+    first = -memory.ctypes.data % 64 // 4
+    found = memory[first : first + size]
+    table, place = found.reshape(shape), 0
+    for column in columns:
+        table[:, place : place + column.shape[1]] = column.take(rows, 0)
+        place += column.shape[1]
+    return found
+
+
+def for_each_near(
+    dr: Any,
+    table: Table,
+    radius: float,
+    place: Lanes,
+    visit: Callable[[Lanes, Lanes], Lanes],
+    count: int,
+) -> tuple[Lanes, Lane]:
+    """So many totals, each 0 at first, that `visit(record, totals)` renews for every
+    point nearer than `radius`, and how many those are.
+
+    A lane notes up to `NOTED` points, then works them off, so that most lanes have
+    something to do at any time, and goes on to look for others.
+    """
+    t = dr.llvm
+    run_of = _runs(dr, table, place)
+
+    def note(column: Lane, row: Lane, stop: Lane, noted: Lane, notes: Any) -> tuple:
+        def test(row: Lane, noted: Lane, notes: Any) -> tuple:
+            found = dr.gather(t.Array4f, table.place, row)
+            near = sum((x - found[i]) ** 2 for i, x in enumerate(place)) < radius**2
+            notes.write(row, noted, near)
+            return row + 1, dr.select(near, noted + 1, noted), notes
+
+        row, noted, notes = dr.while_loop(
+            (row, noted, notes),
+            lambda row, noted, notes: (row < stop) & (noted < NOTED),
+            test,
+        )
+        done = row >= stop
+        column = dr.select(done, column + 1, column)
+        begin, end = run_of(column, done)
+        row, stop = dr.select(done, begin, row), dr.select(done, end, stop)
+        return column, row, stop, noted, notes
+
+    def work_off(number: Lane, notes: Any, *totals: Lane) -> tuple:
+        record = _read(dr, table, notes.read(number))
+        return number + 1, notes, *visit(record, list(totals))
+
+    def round_(
+        column: Lane, row: Lane, stop: Lane, found: Lane, notes: Any, *totals: Lane
+    ) -> tuple:
+        column, row, stop, noted, notes = dr.while_loop(
+            (column, row, stop, zero, notes),
+            lambda column, row, stop, noted, notes: (
+                (column < COLUMNS) & (noted < NOTED)
+            ),
+            note,
+        )
+        _, *rest = dr.while_loop(
+            (zero, notes, *totals), lambda number, *_: number < noted, work_off
+        )
+        return column, row, stop, found + noted, *rest
+
+    # All in full width: loops crash where some lanes share a number that others change.
+    width = dr.width(place[0])
+    zero, totals = dr.zeros(t.UInt32, width), [dr.zeros(t.Float, width)] * count
+    notes = dr.alloc_local(t.UInt32, NOTED)
+    state = zero, *run_of(zero, t.Bool(True)), zero, notes, *totals
+    state = dr.while_loop(state, lambda column, *_: column < COLUMNS, round_)
+    return list(state[5:]), state[3]
+
+
+def _runs(dr: Any, table: Table, place: Lanes) -> Callable[[Lane, Lane], tuple]:
+    """The rows of the cells around each query, by the number of their column."""
+    t = dr.llvm
+    x, y, z = (
+        t.Int32(dr.clip(dr.floor((a - low) * table.rate), -1, t.Float(cells)))
+        for a, low, cells in zip(place, table.low, table.shape, strict=True)
+    )
+    width, depth, height = table.shape
+    first, last = (dr.clip(z + step, 0, height - 1) for step in (-1, 1))
+
+    def run_of(column: Lane, active: Lane) -> tuple[Lane, Lane]:
+        across, along = x + t.Int32(column) // 3 - 1, y + t.Int32(column) % 3 - 1
+        inside = (across >= 0) & (across < width) & (along >= 0) & (along < depth)
+        inside &= active & (column < COLUMNS)
+        base = (across * depth + along) * height
+        return tuple(
+            dr.gather(t.UInt32, table.start, t.UInt32(base + cell), inside)
+            for cell in (first, last + 1)
+        )
+
+    return run_of
+
+
+def _read(dr: Any, table: Table, row: Lane) -> Lanes:
+    """The numbers of a record."""
+    t = dr.llvm
+    packets = dr.width(table.record) * 4 // dr.width(table.place) // PACKET
+    count = dr.width(row)
+    record: Lanes = []
+    for packet in range(packets):
+        place = row * packets + packet
+        part = dr.gather(t.ArrayXf, table.record, place, shape=(PACKET, count))
+        record += [part[i] for i in range(PACKET)]
+    return record
