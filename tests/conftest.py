@@ -93,6 +93,17 @@ def full_compiling(cheap_compiling):
         yield
 
 
+@pytest.fixture(scope="module")
+def in_blocks():
+    """f_2D by JAX, as on a GPU."""
+    from ginn_jax import image, inference  # after the hook, as above
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (image, inference):
+            patch.setattr(module, "lanes_for", lambda network: False)
+        yield
+
+
 @pytest.fixture
 def small_programs(monkeypatch):
     """For whole scripts: few programs, all small, and no process beside this one."""

@@ -16,7 +16,7 @@ import numpy as np
 from dataclasses import replace
 import test_relight as cases
 import tiny
-from ginn_jax import blocks, inference, shading, train
+from ginn_jax import block_shading, blocks, inference, shading, train
 from ginn_jax.lit_clouds import network_numbers
 from ginn_jax.relight import prepare_relighting, relight
 
@@ -28,11 +28,11 @@ variables = jax.device_get(train.init_state(config).variables)
 cloud, queries = cases.lit(1000, 1, (8.0, 1.3)), cases.lit(700, 2, (8.0, 1.3))
 
 # Three turns, the last with a block that is half empty.
-found = cases.shade(network, variables, cloud, queries)
-assert inference.shade_turn._cache_size() == 1
-
 ends = variables, cloud.position, cloud.normal, *network_numbers(cloud)
 encoded, _ = inference.encode_cloud(network, limits, *ends, key=cases.KEY)
+asked = queries.position, queries.normal, *network_numbers(queries)
+found = block_shading.shade_blocks(network, limits, variables, encoded, *asked)[0]
+assert block_shading.shade_turn._cache_size() == 1
 codes = jax.tree.leaves(encoded._replace(center=None, kept=None))
 assert all(len(a.devices()) == 2 for a in codes)
 # The next frame's f_3D runs where this lies: on one.

@@ -18,7 +18,7 @@ from hypothesis import Phase, given, settings
 from oracles import neighbors
 from strategies import ALL_PAIRS, POINTS, SEEDS, UNIT, coordinates, pad
 
-from ginn_jax import hierarchy, inference, packets, recipe, train
+from ginn_jax import block_shading, hierarchy, inference, packets, recipe, train
 from ginn_jax.limits import Limits
 from ginn_jax.receptive_field import kde_weight
 from ginn_jax.voxels import build_grid
@@ -148,20 +148,20 @@ def one_below(demands):
     return Limits(tuple((n, max(int(d) - 1, 1)) for n, d in demands.items()))
 
 
-def counted(monkeypatch, name):
-    """What each call of a function of `image` said that it needed."""
-    calls, function = [], getattr(inference, name)
+def counted(monkeypatch, module, name):
+    """What each call of a function of that module said that it needed."""
+    calls, function = [], getattr(module, name)
 
     def called(*args, **options):
         result = function(*args, **options)
         calls.append({n: int(np.max(d)) for n, d in result[1].items()})
         return result
 
-    monkeypatch.setattr(inference, name, called)
+    monkeypatch.setattr(module, name, called)
     return calls
 
 
-def test_host_calls_find_room_and_drop_nothing(monkeypatch, caplog):
+def test_host_calls_find_room_and_drop_nothing(in_blocks, monkeypatch, caplog):
     """Every capacity lacks one: the result is that with room, at the second attempt."""
     network, roomy = tiny.ONE_LEVEL, tiny.ONE_LEVEL_LIMITS
     config = recipe.Training(network, 1, batch_size=1, points=64, queries=32)
@@ -169,8 +169,8 @@ def test_host_calls_find_room_and_drop_nothing(monkeypatch, caplog):
     cloud = tiny.sphere_on_plane(300, 0)
     ends = cloud.position, cloud.normal
     deep, flat = (
-        counted(monkeypatch, "encode_whole"),
-        counted(monkeypatch, "shade_turn"),
+        counted(monkeypatch, inference, "encode_whole"),
+        counted(monkeypatch, block_shading, "shade_turn"),
     )
 
     def run(limits):
@@ -204,7 +204,7 @@ def test_host_calls_find_room_and_drop_nothing(monkeypatch, caplog):
 
 def test_one_stage_without_room_does_not_swell_the_others(monkeypatch):
     """A Poisson disk that misses edges keeps points in crowds, with edges in crowds."""
-    calls = counted(monkeypatch, "encode_whole")
+    calls = counted(monkeypatch, inference, "encode_whole")
     network, roomy = tiny.ONE_LEVEL, dict(tiny.ONE_LEVEL_LIMITS.sizes)
     config = recipe.Training(network, 1, batch_size=1, points=64, queries=32)
     variables = train.init_state(config).variables

@@ -1,4 +1,4 @@
-"""Values at points and pixels, by a network with its initial parameters."""
+"""Values at points and pixels in blocks, by a network with its initial parameters."""
 
 import jax
 import numpy as np
@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis.extra.numpy import arrays
 from hypothesis.strategies import floats
 
-from ginn_jax import blocks, image, inference
+from ginn_jax import block_shading, blocks, image, inference
 from ginn_jax.errors import InputError
 from ginn_jax.limits import Limits
 
@@ -16,7 +16,7 @@ KEY = jax.random.key(3)
 PIXELS = 300
 
 
-pytestmark = pytest.mark.usefixtures("cheap_compiling")
+pytestmark = pytest.mark.usefixtures("cheap_compiling", "in_blocks")
 
 
 @pytest.fixture(autouse=True)
@@ -177,20 +177,20 @@ def test_points_in_order_need_no_sorting(variables, encoded, values):
     points = tiny.sphere_on_plane(PIXELS, 5)
     ends = points.position, points.normal
     arguments = (tiny.NETWORK, tiny.LIMITS, variables, encoded, *ends)
-    found, _ = inference.shade_points(*arguments, coherent=True)
+    found, _ = block_shading.shade_blocks(*arguments, coherent=True)
     np.testing.assert_allclose(found, values, atol=1e-6)
 
 
 def test_number_of_blocks_is_that_of_the_foreground(
     variables, encoded, values, monkeypatch
 ):
-    calls, shade_turn = [], inference.shade_turn
+    calls, shade_turn = [], block_shading.shade_turn
 
     def counted(*arguments):
         calls.append(int(arguments[5][0].mask.sum()))
         return shade_turn(*arguments)
 
-    monkeypatch.setattr(inference, "shade_turn", counted)
+    monkeypatch.setattr(block_shading, "shade_turn", counted)
     mask = np.arange(24 * 25).reshape(24, 25) >= 300
     arguments = (tiny.NETWORK, tiny.LIMITS, variables, encoded)
     image.shade_image(*arguments, *picture(mask), mask)
@@ -253,13 +253,13 @@ def ground_picture():
 
 
 def test_a_lower_rate_computes_fewer_pixels(variables, encoded, monkeypatch):
-    shaded, shade_points = [], inference.shade_points
+    shaded, shade_blocks = [], block_shading.shade_blocks
 
     def counted(*arguments, **options):
         shaded.append(len(arguments[4]))
-        return shade_points(*arguments, **options)
+        return shade_blocks(*arguments, **options)
 
-    monkeypatch.setattr(image, "shade_points", counted)
+    monkeypatch.setattr(image, "shade_blocks", counted)
     position, normal, mask = ground_picture()
     arguments = (tiny.NETWORK, tiny.LIMITS, variables, encoded, position, normal, mask)
     full, _ = image.shade_image(*arguments)

@@ -117,7 +117,7 @@ def test_a_picture_far_away_has_the_edges_that_it_has_here(offset, monkeypatch):
     def shade_heights(network, limits, variables, encoded, position, *_):
         return np.float32(position[:, 1] - offset > 0.01), limits
 
-    monkeypatch.setattr(image, "shade_points", shade_heights)
+    tiny.shade_pixels_by(monkeypatch, shade_heights)
     x, z = np.meshgrid(*2 * [np.linspace(-0.6, 0.6, 24)])
     upper = x < 0
     position = np.stack([x, np.where(upper, 0.02, 0.0), z], axis=-1) + offset

@@ -175,7 +175,7 @@ def test_colours_are_interpolated_each_by_itself(monkeypatch):
     def shade_points(network, limits, variables, encoded, position, *others):
         return 1 + position @ slopes, limits
 
-    monkeypatch.setattr(image, "shade_points", shade_points)
+    tiny.shade_pixels_by(monkeypatch, shade_points)
     encoded = Encoded(None, None, None, None, np.ones(3, np.float32))  # type: ignore
     mask = np.arange(SIZE)[None, :] + np.zeros((SIZE, 1)) != 9
     position, normal, _ = plane()
@@ -201,7 +201,7 @@ def test_light_stays_with_its_pixels(monkeypatch):
         np.testing.assert_allclose(light[..., 0].T, 1 + place @ slopes, rtol=1e-5)
         return material[..., 0].T, limits
 
-    monkeypatch.setattr(image, "shade_points", shade_points)
+    tiny.shade_pixels_by(monkeypatch, shade_points)
     network = replace(tiny.ONE_LEVEL, lights=1, materials=1, asks="all")
     position, normal, _ = plane()
     mask = np.arange(SIZE)[None] + np.zeros((SIZE, 1)) != 9

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jax._src import compiler
 
-from ginn_jax import recipe, train
+from ginn_jax import image, recipe, train
 from ginn_jax.dataset import ShadedPoints, stack_clouds
 from ginn_jax.limits import Limits
 from ginn_jax.presets import compact_network
@@ -86,6 +86,12 @@ def exact_openness(position, normal):
 def batch(first=0):
     """Two clouds of 1200 points."""
     return stack_clouds([sphere_on_plane(1200, first + i) for i in range(2)])
+
+
+def shade_pixels_by(monkeypatch, function):
+    """Let pixels be shaded by that, which is called as `shade_blocks` is."""
+    monkeypatch.setattr(image, "lanes_for", lambda network: False)
+    monkeypatch.setattr(image, "shade_blocks", function)
 
 
 def step(state, data, config=CONFIG, limits=LIMITS):

@@ -1,0 +1,88 @@
+"""Loops over the points near a query visit each of those once, and no other."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import FACES, FAR, RADII, UNIT, clouds, coordinates
+
+from ginn_jax import cells, lanes
+from ginn_jax.renderer import use_drjit
+
+FACTORS = st.sampled_from([1.0, 1e-6, 1e6])
+
+
+@st.composite
+def scenes(draw):
+    """A cloud with at least one point that counts, queries and a radius."""
+    points = draw(clouds().filter(len))
+    mask = np.ones(len(points), bool)
+    mask[draw(st.lists(st.integers(0, len(points) - 1)))] = False
+    mask[draw(st.integers(0, len(points) - 1))] = True
+    queries = draw(coordinates(UNIT | FACES | FAR, 1, 20) | st.just(points))
+    factor = np.float32(draw(FACTORS))
+    return points * factor, mask, queries * factor, draw(RADII) * float(factor)
+
+
+def loop(points, mask, queries, radius):
+    """How many points each query finds, and sums of two numbers that they have."""
+    dr = use_drjit()
+    t = dr.llvm
+    number = np.arange(1, len(points) + 1, dtype=np.float32)[:, None]
+    columns = [points, number, number * 37 % 101]
+    table = lanes.make_table(dr, points, mask, columns, radius)
+    lane = dr.arange(t.UInt32, len(queries))
+    flat = t.Float(np.ascontiguousarray(queries).reshape(-1))
+    place = [dr.gather(t.Float, flat, 3 * lane + i) for i in range(3)]
+
+    def visit(record, totals):
+        return [a + b for a, b in zip(totals, record[3:5], strict=True)]
+
+    totals, found = lanes.for_each_near(dr, table, radius, place, visit, 2)
+    dr.eval(totals, found)
+    return [a.numpy() for a in (found, *totals)]
+
+
+def check(points, mask, queries, radius):
+    away = queries[:, None].astype(np.float64) - points[mask]
+    distance = np.sqrt(np.sum(away**2, axis=-1)) / radius
+    near, maybe = distance < 1 - 1e-5, distance < 1 + 1e-5
+    number = np.flatnonzero(mask) + 1.0
+    found = loop(points, mask, queries, radius)
+    for values, each in zip(found, (number**0, number, number * 37 % 101), strict=True):
+        # What is at exactly the radius may count or not, but in all three.
+        assert (values >= near @ each - 0.5).all()
+        assert (values <= maybe @ each + 0.5).all()
+        certain = (near == maybe).all(axis=1)
+        np.testing.assert_array_equal(values[certain], (near @ each)[certain])
+
+
+@given(scenes())
+def test_each_point_near_is_visited_once(scene):
+    check(*scene)
+
+
+@pytest.mark.parametrize("noted", [1, 2, 5])
+def test_no_note_is_lost_where_there_is_room_for_few(noted, monkeypatch):
+    monkeypatch.setattr(lanes, "NOTED", noted)
+    rng = np.random.default_rng(0)
+    points, queries = (rng.uniform(size=(n, 3)).astype(np.float32) for n in (400, 50))
+    crowd = np.concatenate([points, np.repeat(points[:1], 100, axis=0)])
+    check(crowd, np.ones(500, bool), queries, 0.3)
+
+
+@given(clouds().filter(len), RADII, st.sampled_from([1, 30, 1 << 19]))
+def test_cells_hold_all_points_and_are_wide_enough(points, radius, most):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cells, "MOST", most)
+        found = cells.sort_into_cells(points, radius)
+    assert len(found.start) == np.prod(found.shape) + 1 <= most + 1
+    assert 1 / found.rate >= radius
+    np.testing.assert_array_equal(np.sort(found.order), np.arange(len(points)))
+    assert found.start[0] == 0
+    assert found.start[-1] == len(points)
+    place = np.floor((points - found.low) * found.rate).astype(int)
+    number = np.ravel_multi_index(tuple(place.T), found.shape)
+    for cell in np.unique(number):
+        rows = found.order[found.start[cell] : found.start[cell + 1]]
+        np.testing.assert_array_equal(rows, np.flatnonzero(number == cell))
