@@ -16,7 +16,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     samples           points on surfaces, drawn from a mesh or read from a scan
     sdf, solids, *_shapes, shapes    the seeded source of procedural objects
     camera            pinhole cameras
-    libllvm, renderer the ray tracer, found and loaded
+    libllvm, renderer the ray tracer and its compiler, found and loaded
     reference         ambient occlusion and G-buffers by ray tracing
     visible           samples of the surface that light can reach
     radiance_files    what the renderer does not check of a map's file
@@ -61,6 +61,11 @@ Modules, in the order the data flows; each imports only what stands before it:
     disk_radius       a trained network on finer or coarser points
     upsample          shading at a lower rate, guided by the G-buffer
     blocks            points padded, queries in blocks for all devices
+    block_shading     f_2D by JAX, block after block
+    cells             points by cell, as loops go through them
+    lanes             loops over the points near a query, a query in every lane
+    lane_layers       layers of a query in a lane
+    lane_shading      f_2D in lanes, on a CPU
     inference         f_3D of a cloud once, f_2D at any points, sized by themselves
     image             from a G-buffer to an image
     plans             what no light changes of f_3D and f_2D, and the rest

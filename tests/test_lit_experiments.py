@@ -259,7 +259,7 @@ def test_relight_and_frame_benchmarks(tmp_path, monkeypatch):
         [case] = frame.main(more)["cases"]
         made = frame.make_frame(more, network, "gi")
         calls = frame.calls_of(network, trained[1], weights, made)
-        values, _ = calls["f_2D, programs"]()
+        values, _ = calls["f_2D in blocks, programs"]()
         seen = calls["f_2D"]()[made.gbuffer.mask]
     assert case["pixels"] == len(seen)
     # The same pixels in an order of their own; what is below zero shows as black.
