@@ -28,7 +28,7 @@ def sort_into_cells(position: Float[np.ndarray, "N 3"], radius: float) -> Cells:
     own cell and the 26 around it."""
     along = np.ascontiguousarray(position.T)
     low, high = along.min(axis=1), along.max(axis=1)
-    extent = (high - low).astype(np.float64)
+    extent = high.astype(np.float64) - low
     width = max((1 + MARGIN) * radius, extent.max() / LONGEST)
     while np.prod(np.floor(extent / width) + 1) > MOST:
         width *= 1.25

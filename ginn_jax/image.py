@@ -21,7 +21,7 @@ from ginn_jax.lane_shading import lanes_for, shade_in_lanes
 from ginn_jax.limits import Limits
 from ginn_jax.network import Variables
 from ginn_jax.process import on_cpu
-from ginn_jax.searches import warn_of_gaps
+from ginn_jax.searches import check_limits, warn_of_gaps
 from ginn_jax.shading import Encoded
 from ginn_jax.upsample import (
     Surface,
@@ -125,6 +125,7 @@ def shade_image(
         InputError: another resolution scale, arrays of unequal size, a mask that is not
             of bool, or pixels in it that `shade_points` refuses.
     """
+    check_limits(network, limits)
     check_image(position, normal, mask, background)
     step = shading_step(resolution_scale)
     surface = Surface(*map(np.asarray, (position, normal, mask)))
@@ -195,7 +196,11 @@ def _shade_rows(
         taken: list[Any] = [None if a is None else a.take(rows, -2) for a in ends]
         check_queries(network, encoded, *taken)
 
-    check(rows[:0])  # types and shapes
+    try:
+        check(rows[:0])  # types and shapes
+    except InputError:
+        check(rows)  # says how many
+        raise
     shaded = shade_in_lanes(network, variables, encoded, *ends, rows=rows)
     if shaded.doubtful:
         check(rows)

@@ -31,7 +31,7 @@ from ginn_jax.limits import (
 from ginn_jax.neighbors import bucket
 from ginn_jax.network import Variables
 from ginn_jax.receptive_field import Oriented
-from ginn_jax.searches import uniform_limits, warn_of_gaps
+from ginn_jax.searches import check_limits, uniform_limits, warn_of_gaps
 from ginn_jax.shading import Encoded, cloud_demands, encode
 
 encode_whole = jax.jit(encode, static_argnums=(0, 1))
@@ -136,8 +136,10 @@ def shade_points(
     themselves are needed only where the network asks for all.
 
     Raises:
-        InputError: as `encode_cloud`, but for no points at all, which have no values.
+        InputError: as `encode_cloud`, but for no points at all, which have no values;
+            or limits of another network.
     """
+    check_limits(network, limits)
     check_queries(network, encoded, position, normal, material, light)
     asked = numbers_asked(network, material, light)
     ends = variables, encoded, position, normal, *asked

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ginn_jax.architecture import Network
+from ginn_jax.checks import LARGEST
 from ginn_jax.errors import InputError
 from ginn_jax.facets import OWN
 from ginn_jax.lane_layers import dot, head, perceptron
@@ -20,8 +21,8 @@ from ginn_jax.process import LOG, on_cpu
 from ginn_jax.renderer import use_drjit
 from ginn_jax.shading import Encoded
 
-# Multiplications an edge that Dr.Jit still compiles in seconds.
-LONGEST = 1 << 13
+# Multiplications that Dr.Jit still compiles in seconds.
+LONGEST = 1 << 14
 
 
 class Shaded(NamedTuple):
@@ -45,12 +46,25 @@ class Query(NamedTuple):
 
 def lanes_for(network: Network) -> bool:
     """Whether that f_2D runs in lanes here: on a CPU with a libLLVM, unless it splats,
-    or has the paper's density for each pair, batch norms or a very wide kernel."""
-    edge = network.hidden * (7 + network.hidden + 2 * network.latent)
+    or has the paper's density for each pair, batch norms or very wide layers."""
     plain = network.query.before == "raw" and not network.query.mixes
     simple = network.density == "surface" and network.norm != "batch"
-    possible = plain and simple and not network.splat and edge <= LONGEST
-    return possible and _lanes_usable()
+    possible = plain and simple and not network.splat
+    return possible and _products(network) <= LONGEST and _lanes_usable()
+
+
+def _products(network: Network) -> int:
+    """About how many multiplications the program has: every weight stands in it."""
+    linear = network.beams or (network.latent if network.linear else 0)
+    light = network.lights if network.local or linear else 0
+    width = network.latent + linear + light
+    group = network.group or width
+    kernels = -(-width // group)
+    colours = 3 if network.lights else 1
+    edge = kernels * network.hidden * (7 + network.hidden + group) + colours * width
+    seen = 3 + network.materials + network.lights
+    row = network.latent + seen + network.head + linear + 2 * light
+    return edge + colours * network.head * row
 
 
 @functools.cache
@@ -61,7 +75,7 @@ def _lanes_usable() -> bool:
     try:
         use_drjit()
     except InputError as error:
-        LOG.warning("f_2D takes two to three times as long without: %s", error)
+        LOG.warning("f_2D runs in JAX alone, for two to three times as long: %s", error)
         return False
     return True
 
@@ -135,9 +149,10 @@ def _doubtful(dr: Any, query: Query) -> Lane:
     known = [*query.place, *light, *(x for lanes in query.material for x in lanes)]
     sound = dr.abs(squared - 1) < 1.9e-3
     for number in known:
-        sound &= dr.isfinite(number)
+        sound &= dr.abs(number) < LARGEST
     for number in light:
-        sound &= number >= 0
+        # By its sign: what is nearly 0 may count as 0.
+        sound &= dr.reinterpret_array(dr.llvm.Int32, number) >= 0
     return ~sound
 
 

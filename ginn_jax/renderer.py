@@ -1,10 +1,11 @@
-"""Mitsuba, the ray tracer behind every reference: imported on first use, here alone."""
+"""Mitsuba, the ray tracer behind every reference, and Dr.Jit, which compiles it and
+f_2D on a CPU: imported on first use, here alone."""
 
 import ctypes
 import functools
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from ginn_jax import libllvm
@@ -30,7 +31,7 @@ def use_drjit() -> Any:
     """Dr.Jit's module, with a libLLVM to compile for the CPU."""
     if "drjit" not in sys.modules:
         libllvm.use_libllvm()
-    with _explained():
+    with _explained("Dr.Jit"):
         import drjit
     # The caller may have imported Dr.Jit before, with what it found (-1: nothing).
     major = drjit.detail.llvm_version()[0]
@@ -46,7 +47,10 @@ def use_mitsuba() -> tuple[Any, str]:
     variant = "cuda_ad_rgb" if _cuda_usable() else "llvm_ad_rgb"
     if variant == "llvm_ad_rgb":
         use_drjit()
-    with _explained():
+    elif "drjit" not in sys.modules:
+        with suppress(InputError):  # f_2D on the CPU may want one later
+            libllvm.use_libllvm()
+    with _explained("Mitsuba"):
         import mitsuba
     if mitsuba.variant() is None:  # `variant_context` cannot put back no variant
         mitsuba.set_variant(variant)
@@ -54,12 +58,12 @@ def use_mitsuba() -> tuple[Any, str]:
 
 
 @contextmanager
-def _explained() -> Iterator[None]:
+def _explained(name: str) -> Iterator[None]:
     """Say of a module that cannot be imported what is missing."""
     try:
         yield
     except (ImportError, NameError) as error:  # Dr.Jit hides what it misses
         raise InputError(
-            f"Mitsuba cannot be loaded ({error.__context__ or error}): install what is "
+            f"{name} cannot be loaded ({error.__context__ or error}): install what is "
             "missing, such as `apt-get install libatomic1`"
         ) from error

@@ -62,6 +62,12 @@ def limit_names(network: Network) -> tuple[str, ...]:
     return tuple(names)
 
 
+def check_limits(network: Network, limits: Limits) -> None:
+    """Raise `InputError` unless these are limits of that network."""
+    for name in limit_names(network):
+        limits.of(name)
+
+
 def shared_search(network: Network, level: int) -> Conv | None:
     """The convolution whose edges tell the Poisson disks of a level as well, if any:
     that within the level before, where it reaches as far."""

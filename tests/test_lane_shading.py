@@ -9,7 +9,7 @@ import pytest
 import tiny
 from test_relight import EFFECTS, lit
 
-from ginn_jax import block_shading, image, inference, lane_shading, train
+from ginn_jax import block_shading, image, inference, lane_shading, presets, train
 from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import network_numbers
 from ginn_jax.process import LOG
@@ -31,7 +31,10 @@ OTHERS = {
     "mixing": replace(
         tiny.ONE_LEVEL, query=replace(tiny.ONE_LEVEL.query, mixes=True, before="raw")
     ),
-    "wide": replace(tiny.ONE_LEVEL, latent=512),
+    "wide": replace(tiny.ONE_LEVEL, latent=2048),
+    "many small kernels": replace(tiny.ONE_LEVEL, latent=64, hidden=32, group=1),
+    "wide head": replace(presets.DEFAULTS["sss"], head=1024),
+    "wide beams": replace(presets.DEFAULTS["sss"], beams=2000),
     "dense before": replace(
         tiny.ONE_LEVEL, query=replace(tiny.ONE_LEVEL.query, before="dense")
     ),
@@ -84,6 +87,14 @@ def test_lanes_say_what_blocks_say(name):
     pairs = sum(int(np.sum(d[f"{network.query.name}.edges"])) for d in made[1])
     assert shaded.pairs == pairs > 300
     assert not shaded.doubtful
+
+
+@pytest.mark.parametrize("presets_of", [presets.ILLUMINATION, presets.SCATTERING])
+@pytest.mark.parametrize("name", ["homogeneous", "linear", "narrow", "wide", "only_2d"])
+def test_presets_run_in_lanes(presets_of, name):
+    assert lane_shading.lanes_for(presets_of[name])
+    assert lane_shading.lanes_for(presets.PRESETS["default"])
+    assert not lane_shading.lanes_for(presets_of["released"])
 
 
 @pytest.mark.parametrize("name", OTHERS)
@@ -142,16 +153,80 @@ def test_one_bad_pixel_is_refused(change, message):
     given = {"position": position, "normal": normal, "material": material}
     given |= {"light": light}
     row = tuple(np.argwhere(MASK)[17])
-    given[change][(..., *row, 0)] = np.inf
-    with pytest.raises(InputError, match=rf"^{message}[^\n]*\Z"):
-        shade_picture("smooth", MASK, **given)
-    given[change][(..., *row, 0)] = -1 if change == "light" else 2
-    if change == "light":
-        with pytest.raises(InputError, match=r"^light holds numbers below 0[^\n]*\Z"):
-            shade_picture("smooth", MASK, **given)
+    bad = {np.inf: message, np.nan: message}
     if change == "normal":
-        with pytest.raises(InputError, match=rf"^{message}[^\n]*\Z"):
+        bad[2] = message
+    if change == "light":
+        bad |= dict.fromkeys([-1, -1e-40], "light holds numbers below 0")
+    for number, said in bad.items():
+        given[change][(..., *row, 0)] = number
+        with pytest.raises(InputError, match=rf"^{said}[^\n]*\Z"):
             shade_picture("smooth", MASK, **given)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"material": np.ones((3, 24, 25, 2))}, r"material is \(3, 300, 2\), the netw"),
+        ({"light": None}, r"light is \(0,\), the network takes \[C 300 1\]"),
+        ({"light": np.ones((2, 24, 25, 1))}, r"codes have \[2, 3\] channels"),
+        ({"position": np.ones((24, 25, 3), "U1")}, "points holds <U1: give real"),
+        ({"normal": np.ones((24, 25, 3), complex)}, "normals holds complex128"),
+    ],
+)
+def test_what_does_not_fit_is_refused(change, message, unchecked):
+    with pytest.raises(InputError, match=rf"^[^\n]*{message}[^\n]*\Z"):
+        shade_picture("smooth", MASK, **change)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5, 1 / 3])
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+@pytest.mark.parametrize("name", ["occlusion", "beams"])
+def test_images_are_those_of_blocks(name, kind, scale, monkeypatch):
+    """Of level ground with a gap, at any rate, some of it brighter than can be."""
+    network, limits, variables, encoded, _ = case(name)
+    loud = jax.tree.map(np.array, variables)
+    loud["shader"]["params"]["Dense_1"]["kernel"] *= 3
+    x, z = np.meshgrid(np.linspace(-0.6, 0.6, 32), np.linspace(-0.6, 0.6, 30))
+    position = np.stack([x, np.zeros_like(x), z], axis=-1).astype(kind)
+    normal = np.broadcast_to(np.array([0, 1, 0], kind), position.shape)
+    mask = np.abs(x - 0.11) > 0.05
+    numbers = {}
+    if network.lights:
+        ones = np.ones((3, *mask.shape, 1), kind)
+        numbers = {
+            "material": np.repeat(ones, 3, -1) / 2,
+            "light": ones * (1 + x**2)[..., None],
+        }
+    given = network, limits, loud, encoded, position, normal, mask, 7.0, scale
+    found, same = image.shade_image(*given, **numbers)
+    assert same == limits
+    monkeypatch.setattr(image, "lanes_for", lambda network: False)
+    expected, _ = image.shade_image(*given, **numbers)
+    size = np.abs(expected[mask]).max()
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-4 * size)
+    assert (found[~mask] == 7).all()
+    assert found[mask].min() == 0
+    assert found.dtype == np.float32
+
+
+def test_no_pixel_is_background():
+    network, limits, variables, encoded, _ = case("beams")
+    blank, nothing = np.full((5, 4, 3), np.nan, np.float32), np.zeros((5, 4), bool)
+    numbers = {"material": np.ones((3, 5, 4, 3)), "light": np.ones((3, 5, 4, 1))}
+    given = network, limits, variables, encoded, blank, blank, nothing
+    found, _ = image.shade_image(*given, **numbers)
+    np.testing.assert_array_equal(found, np.ones((5, 4, 3), np.float32))
+
+
+def test_limits_of_another_network_are_refused():
+    network, _, variables, encoded, asked = case("occlusion")
+    other = uniform_limits(presets.RELEASED, 64)
+    with pytest.raises(InputError, match=r"^the limits lack [^\n]*\Z"):
+        inference.shade_points(network, other, variables, encoded, *asked)
+    position, normal, _ = picture(MASK, asked)
+    with pytest.raises(InputError, match=r"^the limits lack [^\n]*\Z"):
+        image.shade_image(network, other, variables, encoded, position, normal, MASK)
 
 
 def test_numbers_may_be_of_any_real_type(unchecked):
@@ -198,10 +273,10 @@ def test_queries_far_away_find_nothing_and_disturb_no_other():
 
 def test_without_libllvm_there_are_blocks(monkeypatch, caplog):
     def missing():
-        raise InputError("ray tracing needs libLLVM")
+        raise InputError("Dr.Jit needs libLLVM")
 
     monkeypatch.setattr(lane_shading, "use_drjit", missing)
     usable = lane_shading._lanes_usable.__wrapped__
     assert not usable()
     assert [r.name for r in caplog.records] == [LOG.name]
-    assert "ray tracing needs libLLVM" in caplog.text
+    assert "Dr.Jit needs libLLVM" in caplog.text

@@ -71,6 +71,22 @@ def test_no_note_is_lost_where_there_is_room_for_few(noted, monkeypatch):
     check(crowd, np.ones(500, bool), queries, 0.3)
 
 
+def test_rounding_moves_no_point_out_of_reach():
+    """A thousand cells along a line, points and queries on both sides of each face."""
+    radius = 1e-3
+    faces = np.arange(990) * (1 + cells.MARGIN) * radius
+    points = np.zeros((2 * len(faces), 3), np.float32)
+    points[:, 2] = np.concatenate([np.nextafter(np.float32(faces), 0), faces])
+    for axes in ([0, 1, 2], [2, 0, 1], [1, 2, 0]):
+        near = points[:, axes]
+        along = np.zeros(3)
+        along[axes.index(2)] = 0.9999 * radius
+        queries = np.concatenate([near + along, near - along]).astype(np.float32)
+        check(near, np.ones(len(near), bool), queries, radius)
+    found = cells.sort_into_cells(points, radius)
+    assert 1 / np.float64(found.rate) >= (1 + cells.MARGIN / 2) * radius
+
+
 @given(clouds().filter(len), RADII, st.sampled_from([1, 30, 1 << 19]))
 def test_cells_hold_all_points_and_are_wide_enough(points, radius, most):
     with pytest.MonkeyPatch.context() as patch:
