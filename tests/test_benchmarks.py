@@ -91,7 +91,7 @@ def test_stages_of_the_step(stage):
 
 
 def test_f2d(tmp_path, monkeypatch):
-    """Ours and the straightforward form agree, or `compare` raises."""
+    """In lanes, in blocks and straightforward: all agree, or `compare` raises."""
     stand_in(monkeypatch)
     monkeypatch.setattr(f2d, "compact_network", lambda **_: tiny.ONE_LEVEL)
     options = f2d.Options(
@@ -112,6 +112,7 @@ def test_f2d(tmp_path, monkeypatch):
     assert set(case["timings"]) == {
         "ours",
         "ours, scale 1/2",
+        "in blocks",
         "straightforward",
         "1 rays",
     }
