@@ -18,6 +18,7 @@ from ginn_jax.lane_layers import dot, head, perceptron
 from ginn_jax.lanes import Lane, Lanes, for_each_near, make_table
 from ginn_jax.network import Variables
 from ginn_jax.process import LOG, on_cpu
+from ginn_jax.receptive_field import pair_inputs
 from ginn_jax.renderer import use_drjit
 from ginn_jax.shading import Encoded
 
@@ -162,7 +163,7 @@ def _shade(
     """The value of every channel, and the number of pairs."""
     params = variables["shader"]["params"]
     scale = [1.0] if encoded.scale is None else np.asarray(encoded.scale).tolist()
-    query = _smoothed(dr, network, encoded, query, len(scale))
+    query = _smoothed(dr, network, encoded, query)
     summed, pairs = _convolved(dr, network, params[network.query.name], encoded, query)
     tiny = float(np.finfo(np.float32).tiny)
     values = []
@@ -179,9 +180,7 @@ def _shade(
     return values, pairs
 
 
-def _smoothed(
-    dr: Any, network: Network, encoded: Encoded, query: Query, channels: int
-) -> Query:
+def _smoothed(dr: Any, network: Network, encoded: Encoded, query: Query) -> Query:
     """Normal and light as means over the samples around, where facets are smoothed."""
     if encoded.around is None:
         return query
@@ -191,14 +190,12 @@ def _smoothed(
     columns = [position, normal, *lit]
     table = make_table(dr, position, mask, columns, network.smooth)
     own = query.normal + [x for lanes in query.light for x in lanes]
+    ends = query.place + query.normal
 
     def visit(record: Lanes, totals: Lanes) -> Lanes:
-        offset = [
-            (x - y) / network.smooth
-            for x, y in zip(query.place, record[:3], strict=True)
-        ]
-        alike = dr.maximum(dot(query.normal, record[3:6]), 0)
-        weight = dr.maximum(1 - dot(offset, offset), 0) * alike**2
+        inputs = pair_inputs(True, ends, record[:6], network.smooth)
+        near, alike = (dr.maximum(a, 0) for a in (1 - inputs[6], inputs[5]))
+        weight = near * alike**2
         given = [*record[3 : 3 + len(own)], 1.0]
         return [total + weight * x for total, x in zip(totals, given, strict=True)]
 
@@ -209,9 +206,8 @@ def _smoothed(
     mean = [(a + OWN * b) / (weight + OWN) for a, b in zip(totals, own, strict=True)]
     length = dr.rsqrt(dot(mean[:3], mean[:3]))
     width = network.lights
-    light = [mean[3 + i * width : 3 + (i + 1) * width] for i in range(channels)]
-    normal = [x * length for x in mean[:3]]
-    return query._replace(normal=normal, light=light if query.light else [])
+    light = [mean[i : i + width] for i in range(3, len(mean), width or 1)]
+    return query._replace(normal=[x * length for x in mean[:3]], light=light)
 
 
 def _convolved(
@@ -227,16 +223,10 @@ def _convolved(
     table = make_table(dr, position, mask, columns, radius)
     kernel = [np.asarray(a) for a in params["kernel"]]
     free, width = channels[0][0].shape[1], sum(a.shape[1] for a in channels[0])
+    ends = query.place + query.normal
 
     def visit(record: Lanes, totals: Lanes) -> Lanes:
-        offset = [
-            (x - y) * (1 / radius) for x, y in zip(query.place, record[:3], strict=True)
-        ]
-        inputs = offset
-        if network.oriented:
-            ends = query.normal, record[3:6]
-            inputs = [*offset, *(dot(n, offset) for n in ends), dot(*ends)]
-            inputs = [*inputs, dot(offset, offset)]
+        inputs = pair_inputs(network.oriented, ends, record[:6], radius)
         values = [v * record[6] for v in perceptron(dr, kernel, inputs, width)]
         given = record[7 : 7 + len(totals)]
         return [

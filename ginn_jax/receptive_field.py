@@ -92,10 +92,9 @@ def kernel_inputs(
     return _inputs_in_tiles(oriented, *ends, radius, *rows, edges.demand.edges)
 
 
-def _pair_inputs(
-    oriented: bool, x: Float[Array, "6 E"], y: Float[Array, "6 E"], radius: Array
-) -> list[Float[Array, "E"]]:
-    """`kernel_inputs` of receivers x and senders y, position above normal.
+def pair_inputs(oriented: bool, x: Any, y: Any, radius: Any) -> list[Any]:
+    """`kernel_inputs` of receivers x and senders y: six rows each, of edges or lanes,
+    position above normal.
 
     Row by row, sums written out: XLA takes three times as long over whole arrays.
     """
@@ -132,7 +131,7 @@ def _inputs_in_tiles(
             for table, rows in ((receivers, receiver), (senders, sender))
         )
         real = start + jnp.arange(size, dtype=jnp.int32) < count
-        rows = [jnp.where(real, a, 0.0) for a in _pair_inputs(oriented, x, y, radius)]
+        rows = [jnp.where(real, a, 0.0) for a in pair_inputs(oriented, x, y, radius)]
         some = jnp.stack(rows)
         return jax.lax.dynamic_update_slice_in_dim(inputs, some, start, axis=1)
 
@@ -154,7 +153,7 @@ def _inputs_backward(
     real = jnp.arange(receiver.shape[0], dtype=jnp.int32) < count
 
     def plainly(x: Array, y: Array, radius: Array) -> Float[Array, "D E"]:
-        return jnp.stack(_pair_inputs(oriented, x[receiver].T, y[sender].T, radius))
+        return jnp.stack(pair_inputs(oriented, x[receiver].T, y[sender].T, radius))
 
     _, pull = jax.vjp(plainly, *ends)
     return *pull(jnp.where(real, cotangent, 0.0)), None, None, None
