@@ -65,6 +65,10 @@ Modules, in the order the data flows; each imports only what stands before it:
     cells             points by cell, as loops go through them
     lanes             loops over the points near a query, a query in every lane
     lane_layers       layers of a query in a lane
+    lane_fields       sums over the points around: convolutions, areas, facets
+    lane_disks        Poisson disks, a sample in every lane
+    row_layers        layers of f_3D that take a point at a time
+    lane_encoding     f_3D in lanes, on a CPU
     lane_shading      f_2D in lanes, on a CPU
     inference         f_3D of a cloud once, f_2D at any points, sized by themselves
     image             from a G-buffer to an image

@@ -21,7 +21,11 @@ from ginn_jax.blocks import (
     in_rows,
     largest_block,
     make_turns,
+    pad_channels,
+    pad_points,
 )
+from ginn_jax.facets import Around
+from ginn_jax.levels import grid_of
 from ginn_jax.limits import (
     SLACK,
     Demands,
@@ -32,11 +36,13 @@ from ginn_jax.limits import (
     say_raised,
     with_room,
 )
-from ginn_jax.network import Variables
+from ginn_jax.neighbors import bucket, pad_rows
+from ginn_jax.network import Code, Variables
 from ginn_jax.process import ALONE
 from ginn_jax.receptive_field import Oriented
 from ginn_jax.searches import uniform_limits, warn_of_gaps
 from ginn_jax.shading import Encoded, Searched, query_demands, shade
+from ginn_jax.voxels import VoxelGrid
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=ALONE)
@@ -86,6 +92,33 @@ def query_limits(
     return measure_limits(only(ample, network.query.name), probe, len(turns), SLACK)
 
 
+def searchable(network: Network, encoded: Encoded) -> Encoded:
+    """With grids for what JAX searches, where f_3D ran in lanes and made none."""
+    if encoded.grid is not None:
+        return encoded
+    rows, around = bucket(len(encoded.points.mask)), encoded.around
+    points = pad_points(None, *encoded.points[:2], rows)
+    if around is not None:
+        most = bucket(len(around.points.mask))
+        samples = pad_points(None, *around.points[:2], most)
+        light = pad_channels(around.light, most)
+        around = Around(samples, _grid(network, -1, samples), light)
+    free, beams = encoded.code
+    if encoded.scale is None:
+        code = Code(pad_rows(np.asarray(free), rows)[0], None)
+    else:
+        code = Code(pad_channels(free, rows), pad_channels(beams, rows))
+    area = pad_rows(np.asarray(encoded.area), rows)[0]
+    made = points, _grid(network, 0, points), area, code, encoded.scale
+    found = Encoded(*jax.device_put(made), around=jax.device_put(around))
+    return found._replace(center=encoded.center, kept=encoded.kept)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _grid(network: Network, level: int, points: Oriented) -> VoxelGrid:
+    return grid_of(network, {}, level, points)
+
+
 def shade_turns(
     network: Network,
     variables: Variables,
@@ -95,6 +128,7 @@ def shade_turns(
     limits: Limits,
 ) -> tuple[list[Array], list[Demands]]:
     """Values of the blocks of every turn, and their demands; may not be done yet."""
+    encoded = searchable(network, encoded)
     needed = {"shader": variables["shader"]}, encoded._replace(center=None, kept=None)
     given = network, only(limits, network.query.name), coherent, *everywhere(needed)
     made = [shade_turn(*given, turn) for turn in turns]
@@ -116,7 +150,7 @@ def shade_blocks(
 
     Points that come `coherent`, neighbours together, need not be sorted.
     """
-    lit = encoded.scale is not None
+    encoded, lit = searchable(network, encoded), encoded.scale is not None
     turns = make_turns(lit, encoded.center, position, normal, material, light)
     attempt = partial(shade_turns, network, variables, encoded, turns, coherent)
     queries = [turn.queries for turn in turns]

@@ -33,12 +33,40 @@ def sort_into_cells(position: Float[np.ndarray, "N 3"], radius: float) -> Cells:
     while np.prod(np.floor(extent / width) + 1) > MOST:
         width *= 1.25
     rate = np.float32(1 / width)
-    x, y, z = np.floor((along - low[:, None]) * rate).astype(np.int64)
+    x, y, z = ((along - low[:, None]) * rate).astype(np.int32)
     shape = np.array([x.max(), y.max(), z.max()], np.int32) + 1
     number = (x * shape[1] + y) * shape[2] + z
     # Cell and row in one word: NumPy sorts numbers faster than it finds their order.
     bits = len(position).bit_length()
-    order = np.sort((number << bits) + np.arange(len(position))) & ((1 << bits) - 1)
-    start = np.zeros(np.prod(shape) + 1, np.int32)
-    np.cumsum(np.bincount(number, minlength=len(start) - 1), out=start[1:])
+    words = np.sort((number.astype(np.int64) << bits) | np.arange(len(position)))
+    order = words & ((1 << bits) - 1)
+    start = _starts((words >> bits).astype(np.int32), int(np.prod(shape)))
     return Cells(order, start, low, rate, shape)
+
+
+def _starts(number: Int[np.ndarray, "N"], count: int) -> Int[np.ndarray, "T"]:
+    """Of so many cells and the end, the first of these sorted points that is not before
+    it. Most cells are empty: runs of them are written, points are not counted."""
+    first = np.flatnonzero(np.diff(number, prepend=-1)).astype(np.int32)
+    ends = np.append(first, np.int32(len(number)))
+    cells = np.concatenate([[-1], number[first], [count]])
+    start = aligned(1, count + 1).view(np.int32)[0]
+    start[:] = np.repeat(ends, np.diff(cells))
+    return start
+
+
+def thinned(cells: Cells, rows: Int[np.ndarray, "M"]) -> Cells:
+    """The same cells with some of the sorted points only, given in ascending order."""
+    before = np.zeros(len(cells.order) + 1, np.int32)
+    before[rows + 1] = 1
+    np.cumsum(before, out=before)
+    start = aligned(1, len(cells.start)).view(np.int32)[0]
+    before.take(cells.start, out=start, mode="clip")
+    return cells._replace(order=cells.order[rows], start=start)
+
+
+def aligned(rows: int, width: int) -> Float[np.ndarray, "M _"]:
+    """Memory from where Dr.Jit can read packets: the start of a cache line."""
+    memory = np.empty(rows * width + 16, np.float32)
+    first = -memory.ctypes.data % 64 // 4
+    return memory[first : first + rows * width].reshape(rows, width)

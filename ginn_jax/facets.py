@@ -21,17 +21,17 @@ from ginn_jax.limits import Demands, Limits
 from ginn_jax.mcconv import weighted_sum
 from ginn_jax.receptive_field import Field, Oriented, kernel_inputs
 from ginn_jax.searches import facet_searches, search
-from ginn_jax.voxels import VoxelGrid
 
 # What a point's own counts for: all where no sample is around it, else next to nothing.
 OWN = 1e-3
 
 
 class Around(NamedTuple):
-    """The samples of a cloud in a grid to be searched, and the light on them."""
+    """The samples of a cloud and the light on them; `grid`: a `VoxelGrid` where JAX
+    searches them, else None."""
 
     points: Oriented
-    grid: VoxelGrid
+    grid: Any
     light: Float[Any, "C N L"] | None = None
 
 

@@ -1,7 +1,7 @@
 """f_3D of a cloud once, f_2D at any points: on the host, sizing themselves.
 
 Where a capacity is too small they measure what is needed and try again; the limits that
-sufficed come back for reuse. f_2D in lanes needs none.
+sufficed come back for reuse. In lanes neither needs any.
 """
 
 from functools import partial
@@ -15,9 +15,10 @@ from ginn_jax.architecture import Network
 from ginn_jax.block_shading import shade_blocks
 from ginn_jax.blocks import everywhere, pad_channels, pad_points
 from ginn_jax.checks import channels_alike, numbers_of, unit_rows
-from ginn_jax.dataset import center_of
+from ginn_jax.dataset import center_of, relative_to
 from ginn_jax.errors import InputError
 from ginn_jax.example import numbers_asked
+from ginn_jax.lane_encoding import encode_in_lanes, encodes_in_lanes
 from ginn_jax.lane_shading import lanes_for, shade_in_lanes
 from ginn_jax.limits import (
     SLACK,
@@ -59,7 +60,8 @@ def encode_cloud(
     Raises:
         InputError: an empty cloud, or one that is not finite; normals that are not of
             unit length; material or light that the network does not take, or in other
-            channels than each other; light below 0; or `kept_before` of another cloud.
+            channels than each other; light below 0; `kept_before` of another
+            cloud; or limits of another network.
     """
     unit_rows(position, normal, "the cloud")
     if not len(position):
@@ -67,9 +69,16 @@ def encode_cloud(
     numbers_of("material", material, network.materials, len(position))
     numbers_of("light", light, network.lights, len(position), least=0.0)
     channels_alike(material, light)
+    check_limits(network, limits)
     rows = bucket(len(position))
     check_kept(kept_before, (len(network.levels), rows))
     center = center_of(position)
+    if encodes_in_lanes(network):
+        place, mask = relative_to(center, position), np.ones(len(position), bool)
+        whole = Oriented(place, np.asarray(normal, np.float32), mask)
+        given = whole, as_float(material), as_float(light), kept_before
+        encoded = encode_in_lanes(network, variables, *given, key=key)
+        return encoded._replace(center=center), limits
     cloud = pad_points(center, position, normal, rows)
     more = pad_channels(material, rows), pad_channels(light, rows)
 
@@ -86,6 +95,11 @@ def encode_cloud(
     # What f_2D needs is copied to all devices once, not for every image.
     shared = everywhere(encoded._replace(kept=None))
     return shared._replace(center=center, kept=encoded.kept), sufficed
+
+
+def as_float(numbers: Any) -> Float[np.ndarray, "..."] | None:
+    """In NumPy's memory, in single precision."""
+    return None if numbers is None else np.asarray(numbers, np.float32)
 
 
 def nothing_kept(network: Network, points: int) -> Bool[np.ndarray, "L R"]:

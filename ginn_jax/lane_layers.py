@@ -3,7 +3,8 @@
 Every weight is a number in the program, which is compiled anew for other weights.
 """
 
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -11,6 +12,27 @@ from jaxtyping import Float
 from ginn_jax.architecture import Network
 from ginn_jax.lanes import Lane, Lanes
 from ginn_jax.network import EPSILON, SLOPE
+
+
+class Constants(NamedTuple):
+    """Arrays that a program has inside, told apart by what is in them."""
+
+    shapes: tuple[tuple[int, ...], ...]
+    contents: tuple[bytes, ...]
+
+
+def as_constants(arrays: Iterable[Any]) -> Constants:
+    """Arrays of float32 as something that can be looked up."""
+    arrays = [np.asarray(a, np.float32) for a in arrays]
+    return Constants(tuple(a.shape for a in arrays), tuple(a.tobytes() for a in arrays))
+
+
+def from_constants(constants: Constants) -> list[Float[np.ndarray, "..."]]:
+    """The arrays."""
+    return [
+        np.frombuffer(content, np.float32).reshape(shape)
+        for shape, content in zip(*constants, strict=True)
+    ]
 
 
 def head(

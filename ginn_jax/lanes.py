@@ -5,13 +5,15 @@ lane goes through the points in the cells around its query and works off those t
 near: no list, hence no capacity. Dr.Jit, which compiles the ray tracer, compiles it.
 """
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ginn_jax.cells import sort_into_cells
+from ginn_jax.cells import Cells, aligned, sort_into_cells
+from ginn_jax.renderer import use_drjit
 
 # Points near a query that are noted before they are worked off, and numbers of a record
 # that are read at once.
@@ -19,20 +21,38 @@ NOTED, PACKET = 32, 8
 # A query's own column of cells and the eight around it.
 COLUMNS = 9
 
+# Programs that are kept, with weights of their own: those of a dozen networks.
+PROGRAMS, NEVER = 256, 1 << 30
+
 # A number, or a few, in each lane.
 Lane = Any
 Lanes = list[Any]
 
 
+@functools.lru_cache(maxsize=PROGRAMS)
+def program(function: Callable[..., Any], *static: Hashable) -> Callable[..., Any]:
+    """`function(dr, *static, *arrays)`, traced once for all alike arrays of Dr.Jit.
+
+    Tracing it anew would take as long as running it.
+    """
+    dr = use_drjit()
+
+    def run(*arrays: Any) -> Any:
+        return function(dr, *static, *arrays)
+
+    return dr.freeze(run, warn_after=NEVER)
+
+
 class Table(NamedTuple):
-    """Points in cells, in Dr.Jit's memory: where each is, and a record of it."""
+    """Points in cells, in Dr.Jit's memory: where each is, and a record of it.
+
+    `frame` has the low corner of the cells, their rate and how many they are each way.
+    """
 
     place: Any
     record: Any
     start: Any
-    low: list[Any]
-    rate: Any
-    shape: list[Any]
+    frame: Any
 
 
 def make_table(
@@ -44,35 +64,51 @@ def make_table(
 ) -> Table:
     """The points in `mask`, to be searched within that radius; a record is a row of
     these columns side by side."""
-    t, rows = dr.llvm, np.flatnonzero(mask)
+    return make_tables(dr, position, mask, [columns], radius)[0]
+
+
+def make_tables(
+    dr: Any,
+    position: Float[np.ndarray, "N 3"],
+    mask: Bool[np.ndarray, "N"],
+    records: list[list[Float[np.ndarray, "N _"]]],
+    radius: float,
+) -> list[Table]:
+    """`make_table` with some records or others."""
+    rows = np.flatnonzero(mask)
     cells = sort_into_cells(position.take(rows, 0), radius)
     rows = rows[cells.order]
-    return Table(
-        t.Float(_side_by_side([position], rows, 4)),
-        t.Float(_side_by_side(columns, rows, PACKET)),
-        t.UInt32(cells.start),
-        [dr.opaque(t.Float, float(x)) for x in cells.low],
-        dr.opaque(t.Float, float(cells.rate)),
-        [dr.opaque(t.Int32, int(n)) for n in cells.shape],
-    )
+    place = _side_by_side([position], rows, 4)
+    columns = (_side_by_side(columns, rows, PACKET) for columns in records)
+    return [table_in(dr, cells, place, record) for record in columns]
+
+
+def table_in(
+    dr: Any,
+    cells: Cells,
+    place: Float[np.ndarray, "N 4"],
+    record: Float[np.ndarray, "N _"],
+) -> Table:
+    """The points of these cells in their order, from `aligned` memory."""
+    t = dr.llvm
+    frame = aligned(1, 8)[0]
+    frame[:] = *cells.low, cells.rate, *cells.shape, 0
+    start = t.UInt32(cells.start.view(np.uint32))
+    flat = t.Float(place.reshape(-1)), t.Float(record.reshape(-1))
+    return Table(flat[0], flat[1], start, t.Float(frame))
 
 
 def _side_by_side(
     columns: list[Float[np.ndarray, "N _"]], rows: Int[np.ndarray, "M"], packet: int
-) -> Float[np.ndarray, "_"]:
-    """Rows padded to whole packets, from where Dr.Jit can read packets: the start of a
-    cache line."""
+) -> Float[np.ndarray, "M _"]:
+    """Rows padded to whole packets."""
     used = sum(column.shape[1] for column in columns)
-    shape = len(rows), -(-used // packet) * packet
-    size = shape[0] * shape[1]
-    memory = np.zeros(size + 16, np.float32)
-    first = -memory.ctypes.data % 64 // 4
-    found = memory[first : first + size]
-    table, place = found.reshape(shape), 0
+    table, place = aligned(len(rows), -(-used // packet) * packet), 0
+    table[:, used:] = 0
     for column in columns:
         table[:, place : place + column.shape[1]] = column.take(rows, 0)
         place += column.shape[1]
-    return found
+    return table
 
 
 def for_each_near(
@@ -90,7 +126,7 @@ def for_each_near(
     something to do at any time, and goes on to look for others.
     """
     t = dr.llvm
-    run_of = _runs(dr, table, place)
+    run_of = runs_of(dr, table, place)
 
     def note(column: Lane, row: Lane, stop: Lane, noted: Lane, notes: Any) -> tuple:
         def test(row: Lane, noted: Lane, notes: Any) -> tuple:
@@ -138,14 +174,16 @@ def for_each_near(
     return list(state[5:]), state[3]
 
 
-def _runs(dr: Any, table: Table, place: Lanes) -> Callable[[Lane, Lane], tuple]:
+def runs_of(dr: Any, table: Table, place: Lanes) -> Callable[[Lane, Lane], tuple]:
     """The rows of the cells around each query, by the number of their column."""
     t = dr.llvm
+    frame = [dr.gather(t.Float, table.frame, t.UInt32(i)) for i in range(7)]
+    low, rate = frame[:3], frame[3]
+    width, depth, height = map(t.Int32, frame[4:])
     x, y, z = (
-        t.Int32(dr.clip(dr.floor((a - low) * table.rate), -1, t.Float(cells)))
-        for a, low, cells in zip(place, table.low, table.shape, strict=True)
+        t.Int32(dr.clip(dr.floor((a - b) * rate), -1, cells))
+        for a, b, cells in zip(place, low, frame[4:], strict=True)
     )
-    width, depth, height = table.shape
     first, last = (dr.clip(z + step, 0, height - 1) for step in (-1, 1))
 
     def run_of(column: Lane, active: Lane) -> tuple[Lane, Lane]:

@@ -94,8 +94,9 @@ class McConv(nn.Module):
 
     @nn.compact
     def __call__(
-        self, x: Code, mask: Bool[Array, "N"], field: Field, receivers: int
+        self, x: Code, mask: Bool[Array, "N"], field: Field | None, receivers: int
     ) -> Code:
+        """Without a field: what is convolved, by others."""
         conv, network = self.conv, self.network
         free, light = x
         if conv.before in ("norm", "dense"):
@@ -105,6 +106,8 @@ class McConv(nn.Module):
             free = Norm(network.norm, self.train)(free, mask)
             if light is not None:
                 light = Gate(network.beams or conv.channels)(free, light)
+        if field is None:
+            return Code(free, light)
         both = free if light is None else jnp.concatenate([free, light], axis=1)
         kernels = conv.channels * free.shape[1] if conv.mixes else both.shape[1]
         kernel = self.param(
@@ -127,6 +130,31 @@ class McConv(nn.Module):
         else:
             found = mc_conv(kernel, both, field, receivers)
         return Code(found[:, :width], None if light is None else found[:, width:])
+
+
+class Latent(nn.Module):
+    """The code of a point, from its features after the last convolution of f_3D."""
+
+    network: Network
+    train: bool
+
+    @nn.compact
+    def __call__(
+        self, x: Code, light: Float[Array, "N L"] | None, mask: Bool[Array, "N"]
+    ) -> Code:
+        network = self.network
+        free = x.free
+        if network.encoder:
+            free = Norm(network.norm, self.train)(free, mask)
+        free = dense(network.latent, name="latent")(free)
+        free = Norm(network.norm, self.train)(free, mask)
+        beams = []
+        if x.light is not None:
+            width = network.beams or network.latent
+            beams = [Gate(width, name="latent_light")(free, x.light)]
+        if network.local and light is not None:
+            beams = [light, *beams]
+        return Code(free, jnp.concatenate(beams, axis=1) if beams else None)
 
 
 class Encoder(nn.Module):
@@ -152,18 +180,9 @@ class Encoder(nn.Module):
             if conv.skip is not None:
                 x = join(done[conv.skip], x)
             done[conv.name] = x
-        free = x.free
-        if network.encoder:
-            free = Norm(network.norm, self.train)(free, levels[0].mask)
-        free = dense(network.latent, name="latent")(free)
-        free = Norm(network.norm, self.train)(free, levels[0].mask)
-        beams = []
-        if x.light is not None:
-            width = network.beams or network.latent
-            beams = [Gate(width, name="latent_light")(free, x.light)]
-        if network.local and light is not None:
-            beams = [light, *beams]
-        return Code(free, jnp.concatenate(beams, axis=1) if beams else None)
+        latent = Latent(network, self.train)
+        nn.share_scope(self, latent)
+        return latent(x, light, levels[0].mask)
 
 
 def splat(values: Float[Array, "N"], field: Field, receivers: int) -> Float[Array, "M"]:

@@ -19,10 +19,9 @@ from ginn_jax.geometry import Geometry, build_geometry, build_query_field
 from ginn_jax.limits import Demands, Limits
 from ginn_jax.network import Code, Encoder, Shader, Variables
 from ginn_jax.receptive_field import Field, Oriented, in_coherent_order
-from ginn_jax.voxels import VoxelGrid
 
 # The finest level, its grid and the areas of its points; the samples around queries.
-Searched = tuple[Oriented, VoxelGrid, Array | None, Around | None]
+Searched = tuple[Oriented, Any, Array | None, Around | None]
 
 
 class Asking(NamedTuple):
@@ -35,7 +34,9 @@ class Asking(NamedTuple):
 
 
 class Encoded(NamedTuple):
-    """What f_2D needs of a cloud: its finest level, searchable, with codes.
+    """What f_2D needs of a cloud: its finest level, with codes.
+
+    `grid` is a `VoxelGrid` where JAX made them and searches it, else None.
 
     Where there is light, `code` has a leading axis of channels and `scale` is the mean
     light of each channel; else `scale` is None. `points` are relative to `center`.
@@ -44,13 +45,13 @@ class Encoded(NamedTuple):
     """
 
     points: Oriented
-    grid: VoxelGrid
-    area: Array | None
+    grid: Any
+    area: Float[Any, "N"] | None
     code: Code
-    scale: Float[Array, "C"] | None
+    scale: Float[Any, "C"] | None
     center: Float[Any, "3"] | None = None
     around: Around | None = None
-    kept: Bool[Array, "L N"] | None = None
+    kept: Bool[Any, "L N"] | None = None
 
     def searched(self) -> Searched:
         """What the searches of f_2D look into."""

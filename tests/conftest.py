@@ -95,12 +95,13 @@ def full_compiling(cheap_compiling):
 
 @pytest.fixture(scope="module")
 def in_blocks():
-    """f_2D by JAX, as on a GPU."""
+    """f_3D and f_2D by JAX, as on a GPU."""
     from ginn_jax import image, inference  # after the hook, as above
 
     with pytest.MonkeyPatch.context() as patch:
         for module in (image, inference):
             patch.setattr(module, "lanes_for", lambda network: False)
+        patch.setattr(inference, "encodes_in_lanes", lambda network: False)
         yield
 
 

@@ -9,7 +9,15 @@ import pytest
 import tiny
 from test_relight import EFFECTS, lit
 
-from ginn_jax import block_shading, image, inference, lane_shading, presets, train
+from ginn_jax import (
+    block_shading,
+    image,
+    inference,
+    lane_fields,
+    lane_shading,
+    presets,
+    train,
+)
 from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import network_numbers
 from ginn_jax.process import LOG
@@ -275,8 +283,8 @@ def test_without_libllvm_there_are_blocks(monkeypatch, caplog):
     def missing():
         raise InputError("Dr.Jit needs libLLVM")
 
-    monkeypatch.setattr(lane_shading, "use_drjit", missing)
-    usable = lane_shading._lanes_usable.__wrapped__
+    monkeypatch.setattr(lane_fields, "use_drjit", missing)
+    usable = lane_fields.lanes_usable.__wrapped__
     assert not usable()
     assert [r.name for r in caplog.records] == [LOG.name]
     assert "Dr.Jit needs libLLVM" in caplog.text

@@ -1,0 +1,177 @@
+"""Sums over the points around, in lanes: convolutions, areas, smoothed facets."""
+
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ginn_jax.architecture import Network, reach
+from ginn_jax.errors import InputError
+from ginn_jax.facets import OWN, Around
+from ginn_jax.lane_layers import dot, perceptron
+from ginn_jax.lanes import (
+    Lane,
+    Lanes,
+    Table,
+    for_each_near,
+    make_table,
+    make_tables,
+    program,
+)
+from ginn_jax.process import LOG, on_cpu
+from ginn_jax.receptive_field import Oriented, pair_inputs
+from ginn_jax.renderer import use_drjit
+
+# Multiplications that Dr.Jit still compiles in seconds.
+LONGEST = 1 << 14
+
+
+@functools.cache
+def lanes_usable() -> bool:
+    """Whether JAX runs on a CPU here and Dr.Jit finds a libLLVM."""
+    if not on_cpu():
+        return False
+    try:
+        use_drjit()
+    except InputError as error:
+        LOG.warning(
+            "networks run in JAX alone, for two to three times as long: %s", error
+        )
+        return False
+    return True
+
+
+def edge_products(network: Network, width: int, colours: int) -> int:
+    """About how many multiplications an edge takes: each weight stands in a program."""
+    group = network.group or width
+    kernels = -(-width // group)
+    return kernels * network.hidden * (7 + network.hidden + group) + colours * width
+
+
+def safe_inverses(scale: Float[np.ndarray, "C"]) -> Float[np.ndarray, "C"]:
+    """`dataset.safe_inverse` of every unit."""
+    normal = scale >= np.finfo(np.float32).tiny
+    return np.where(normal, 1 / np.where(normal, scale, 1), 0).astype(np.float32)
+
+
+class Query(NamedTuple):
+    """What is known of the point in each lane; material and light of every channel."""
+
+    place: Lanes
+    normal: Lanes
+    material: Sequence[Lanes] = ()
+    light: Sequence[Lanes] = ()
+
+
+def read_rows(dr: Any, numbers: Float[np.ndarray, "N K"], lane: Lane) -> Lanes:
+    """A row in each lane, in the precision that it has."""
+    t, width = dr.llvm, numbers.shape[1]
+    kind, exact = (
+        (t.Float, np.float32)
+        if numbers.dtype == np.float32
+        else (t.Float64, np.float64)
+    )
+    flat = kind(np.ascontiguousarray(numbers, exact).reshape(-1))
+    return [dr.gather(kind, flat, lane * width + i) for i in range(width)]
+
+
+def smoothed(dr: Any, network: Network, around: Around, query: Query) -> Query:
+    """Normal and light as means over the samples around, see `facets`."""
+    points, _, light = around
+    position, normal, mask = map(np.asarray, points)
+    lit = [] if light is None or not query.light else [*np.asarray(light)]
+    columns = [position, normal, *lit]
+    table = make_table(dr, position, mask, columns, network.smooth)
+    own = query.normal + [x for lanes in query.light for x in lanes]
+    ends = query.place + query.normal
+
+    def visit(record: Lanes, totals: Lanes) -> Lanes:
+        inputs = pair_inputs(True, ends, record[:6], network.smooth)
+        near, alike = (dr.maximum(a, 0) for a in (1 - inputs[6], inputs[5]))
+        weight = near * alike**2
+        given = [*record[3 : 3 + len(own)], 1.0]
+        return [total + weight * x for total, x in zip(totals, given, strict=True)]
+
+    count = len(own) + 1
+    (*totals, weight), _ = for_each_near(
+        dr, table, network.smooth, query.place, visit, count
+    )
+    mean = [(a + OWN * b) / (weight + OWN) for a, b in zip(totals, own, strict=True)]
+    length = dr.rsqrt(dot(mean[:3], mean[:3]))
+    width = network.lights
+    light = [mean[i : i + width] for i in range(3, len(mean), width or 1)]
+    return query._replace(normal=[x * length for x in mean[:3]], light=light)
+
+
+def areas(dr: Any, points: Oriented, lanes: Lanes, radius: float, sided: bool) -> Lane:
+    """The area that each of the points stands for: `receptive_field.point_area`."""
+    position, normal, mask = points
+    table = make_table(dr, position, mask, [position, normal], radius)
+    return program(_area, radius, sided)(list(table), lanes)
+
+
+def _area(dr: Any, radius: float, sided: bool, table: Lanes, lanes: Lanes) -> Lane:
+    def visit(record: Lanes, totals: Lanes) -> Lanes:
+        apart = [a - b for a, b in zip(lanes[:3], record[:3], strict=True)]
+        value = dr.maximum(1 - dot(apart, apart) / radius**2, 0) ** 2
+        if sided:
+            value = dr.select(dot(lanes[3:], record[3:6]) >= 0, value, 0)
+        return [totals[0] + value]
+
+    given = Table(*table), radius, lanes[:3], visit, 1
+    (total,), _ = for_each_near(dr, *given)
+    return np.pi * radius**2 / 3 / dr.maximum(total, 1)
+
+
+class Sum(NamedTuple):
+    """What a convolution sums: so many features, in so many channels."""
+
+    oriented: bool
+    radius: float
+    taper: float
+    width: int
+    channels: int
+
+
+def field_tables(
+    dr: Any,
+    sum_: Sum,
+    points: Oriented,
+    area: Float[np.ndarray, "N"],
+    groups: Sequence[Sequence[Float[np.ndarray, "N _"]]],
+) -> list[Table]:
+    """Points with their weights and features, channel after channel, for each group."""
+    position, normal, mask = map(np.asarray, points)
+    weight = np.asarray(area)[:, None] / np.float32(np.pi * sum_.radius**2)
+    records = [[position, normal, weight, *features] for features in groups]
+    return make_tables(dr, position, mask, records, reach(sum_.radius, sum_.taper))
+
+
+def field_sum(
+    dr: Any,
+    sum_: Sum,
+    kernel: Sequence[Float[np.ndarray, "..."]],
+    table: Table,
+    ends: Lanes,
+) -> tuple[Lanes, Lane]:
+    """Features summed around each query by `mcconv`'s rule, and how many points of the
+    table are there; `ends`: position and normal of the queries."""
+    taper = sum_.taper
+
+    def visit(record: Lanes, totals: Lanes) -> Lanes:
+        inputs = pair_inputs(sum_.oriented, ends, record[:6], sum_.radius)
+        weight = record[6]
+        if taper:
+            squared = dot(inputs[:3], inputs[:3])
+            weight *= dr.clip((1 + taper - squared) / (2 * taper), 0, 1)
+        values = [v * weight for v in perceptron(dr, kernel, inputs, sum_.width)]
+        given = record[7 : 7 + len(totals)]
+        return [
+            dr.fma(values[i % sum_.width], x, total)
+            for i, (total, x) in enumerate(zip(totals, given, strict=True))
+        ]
+
+    far, count = reach(sum_.radius, taper), sum_.width * sum_.channels
+    return for_each_near(dr, table, far, ends[:3], visit, count)

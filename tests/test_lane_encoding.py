@@ -1,0 +1,156 @@
+"""f_3D in lanes makes the codes that JAX makes, whatever the network and the cloud."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+import tiny
+from test_lane_shading import NETWORKS, OTHERS, case
+from test_relight import lit
+
+from ginn_jax import inference, lane_encoding, presets
+from ginn_jax.lit_clouds import network_numbers
+from ginn_jax.searches import uniform_limits
+
+pytestmark = pytest.mark.usefixtures("cheap_compiling")
+
+KEY = jax.random.key(3)
+
+
+def encode(network, variables, cloud, numbers, kept_before=None, in_lanes=True):
+    limits = uniform_limits(network, 1 << 15)
+    ends = variables, cloud.position, cloud.normal, *numbers, kept_before
+    with pytest.MonkeyPatch.context() as patch:
+        if not in_lanes:
+            patch.setattr(inference, "encodes_in_lanes", lambda network: False)
+        encoded, same = inference.encode_cloud(network, limits, *ends, key=KEY)
+    assert (encoded.grid is None) == in_lanes
+    assert same == limits or not in_lanes
+    return encoded
+
+
+def scene(name):
+    network, _, variables, _, _ = case(name)
+    medium = (8.0, 1.3) if network.materials == 3 else ()
+    cloud = lit(1500, 4, medium)
+    return (
+        network,
+        variables,
+        cloud,
+        network_numbers(cloud)
+        if network.lights
+        else (
+            None,
+            None,
+        ),
+    )
+
+
+def in_order(encoded):
+    """Real points sorted by place, with their area and codes, channels first."""
+    mask = np.asarray(encoded.points.mask)
+    place = np.asarray(encoded.points.position)[mask]
+    order = np.flatnonzero(mask)[np.lexsort(place.T)]
+    codes = [np.asarray(a) for a in encoded.code if a is not None]
+    codes = [a if a.ndim == 3 else a[None] for a in codes]
+    ends = (np.asarray(a)[order] for a in (*encoded.points[:2], encoded.area))
+    return *ends, np.concatenate(codes, axis=2)[:, order]
+
+
+def assert_alike(network, found, expected):
+    np.testing.assert_array_equal(found.kept, expected.kept)
+    assert found.points.mask.all()
+    for name, a, b in zip(
+        ("position", "normal", "area", "code"),
+        in_order(found),
+        in_order(expected),
+        strict=True,
+    ):
+        assert a.dtype == np.float32
+        # A norm over two channels makes much of their rounding.
+        tolerance = 1e-5 if name != "code" else 3e-4
+        scale = np.abs(b).max()
+        np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * scale, err_msg=name)
+        assert b.std() > 1e-3 * scale > 0
+    for a, b in ((found.scale, expected.scale), (found.center, expected.center)):
+        assert (a is None) == (b is None)
+        if b is not None:
+            np.testing.assert_allclose(a, b, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_lanes_encode_what_jax_encodes(name):
+    given = scene(name)
+    assert lane_encoding.encodes_in_lanes(given[0])
+    assert_alike(given[0], encode(*given), encode(*given, in_lanes=False))
+
+
+def test_what_was_kept_before_is_kept_again():
+    network, variables, cloud, numbers = scene("occlusion")
+    before = inference.nothing_kept(network, 1500)
+    before[:, :1500:7] = True
+    given = network, variables, cloud, numbers, before
+    found = encode(*given)
+    assert_alike(network, found, encode(*given, in_lanes=False))
+    again = encode(*given[:4], found.kept)
+    np.testing.assert_array_equal(again.kept, found.kept)
+    assert (encode(*given[:4]).kept != found.kept).any()
+
+
+@pytest.mark.parametrize("count", [1, 2, 70])
+def test_few_samples_have_codes(count):
+    network, variables, cloud, _ = scene("occlusion")
+    few = jax.tree.map(lambda a: a[:count], cloud)
+    given = network, variables, few, (None, None)
+    assert_alike_but_spread(encode(*given), encode(*given, in_lanes=False))
+
+
+def assert_alike_but_spread(found, expected):
+    for a, b in zip(in_order(found), in_order(expected), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4 * max(np.abs(b).max(), 1))
+
+
+def test_wide_layers_sum_a_channel_at_a_time(monkeypatch):
+    given = scene("beams")
+    whole = encode(*given)
+    monkeypatch.setattr(lane_encoding, "MOST_SUMS", 1)
+    for a, b in zip(in_order(encode(*given)), in_order(whole), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
+
+
+def test_weights_that_change_are_not_mixed_up():
+    """Programs are kept by what their weights are."""
+    network, variables, cloud, numbers = scene("occlusion")
+    other = jax.tree.map(lambda a: np.float32(a * 1.1), variables)
+    first = encode(network, variables, cloud, numbers)
+    second = encode(network, other, cloud, numbers)
+    assert_alike(
+        network, second, encode(network, other, cloud, numbers, in_lanes=False)
+    )
+    assert np.abs(first.code.free - second.code.free).max() > 0.01
+
+
+@pytest.mark.parametrize("name", ["homogeneous", "linear", "narrow", "wide", "only_3d"])
+@pytest.mark.parametrize("presets_of", [presets.ILLUMINATION, presets.SCATTERING])
+def test_presets_run_in_lanes(presets_of, name):
+    assert lane_encoding.encodes_in_lanes(presets_of[name])
+    assert not lane_encoding.encodes_in_lanes(presets_of["released"])
+
+
+MIXING = replace(tiny.NETWORK.encoder[0], mixes=True, before="raw")
+WIDE = replace(tiny.NETWORK.encoder[0], channels=2048)
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        OTHERS["density per pair"],
+        OTHERS["running moments"],
+        replace(tiny.NETWORK, encoder=(MIXING, *tiny.NETWORK.encoder[1:])),
+        replace(tiny.NETWORK, encoder=(WIDE, *tiny.NETWORK.encoder[1:])),
+    ],
+    ids=["density per pair", "running moments", "mixing", "wide"],
+)
+def test_other_networks_are_encoded_by_jax(network):
+    assert not lane_encoding.encodes_in_lanes(network)
