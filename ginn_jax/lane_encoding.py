@@ -20,16 +20,18 @@ from ginn_jax.lane_fields import (
     Query,
     Sum,
     areas,
+    around_table,
     edge_products,
     field_sum,
     field_tables,
+    flat,
     lanes_usable,
-    read_rows,
+    read_row,
     safe_inverses,
     smoothed,
 )
 from ginn_jax.lane_layers import Constants, as_constants, from_constants
-from ginn_jax.lanes import Lanes, Table, program
+from ginn_jax.lanes import Lane, Lanes, Table, program
 from ginn_jax.neighbors import bucket
 from ginn_jax.network import Code, Variables
 from ginn_jax.receptive_field import Oriented
@@ -128,7 +130,7 @@ def _padded(numbers: Float[np.ndarray, "*C N K"] | None) -> Any:
 def _lanes_of(dr: Any, points: Oriented) -> Lanes:
     """Position and normal of a point in each lane."""
     lane = dr.arange(dr.llvm.UInt32, len(points.mask))
-    ends = [x for a in points[:2] for x in read_rows(dr, a, lane)]
+    ends = [x for a in points[:2] for x in read_row(dr, flat(dr, a), 3, lane)]
     dr.eval(ends)
     return ends
 
@@ -143,17 +145,25 @@ def _smooth(
     """The cloud with normals of some rows smoothed, and the light on these."""
     position, normal, mask = around.points
     lane = dr.arange(dr.llvm.UInt32, len(rows))
-    ends = (read_rows(dr, a.take(rows, 0), lane) for a in (position, normal))
-    lit = [read_rows(dr, a, lane) for a in ([] if light is None else light)]
-    found = smoothed(dr, network, around, Query(*ends, light=lit))
-    dr.eval(found.normal, found.light)
-    turned, *lit = (
-        np.stack([x.numpy() for x in lanes], axis=1)
-        for lanes in (found.normal, *found.light)
-    )
+    dr.make_opaque(lane)
+    own = [flat(dr, a.take(rows, 0)) for a in (position, normal)]
+    lit = [flat(dr, a) for a in ([] if light is None else light)]
+    table = around_table(dr, network, around, light is not None)
+    found = program(_smoothed, network)(lane, own, lit, list(table))
+    turned, *lit = (np.stack([x.numpy() for x in lanes], axis=1) for lanes in found)
     normal = normal.copy()
     normal[rows] = turned
     return Oriented(position, normal, mask), np.stack(lit) if lit else None
+
+
+def _smoothed(
+    dr: Any, network: Network, lane: Lane, own: Lanes, lit: Lanes, table: Lanes
+) -> list[Lanes]:
+    """Normal and light of every channel."""
+    ends = (read_row(dr, a, 3, lane) for a in own)
+    light = [read_row(dr, a, network.lights, lane) for a in lit]
+    query = smoothed(dr, network, Table(*table), Query(*ends, light=light))
+    return [query.normal, *query.light]
 
 
 def _areas(

@@ -65,25 +65,30 @@ class Query(NamedTuple):
     light: Sequence[Lanes] = ()
 
 
-def read_rows(dr: Any, numbers: Float[np.ndarray, "N K"], lane: Lane) -> Lanes:
-    """A row in each lane, in the precision that it has."""
-    t, width = dr.llvm, numbers.shape[1]
+def flat(dr: Any, numbers: Float[np.ndarray, "..."]) -> Any:
+    """In Dr.Jit's memory, in the precision that they have."""
+    single = numbers.dtype == np.float32
     kind, exact = (
-        (t.Float, np.float32)
-        if numbers.dtype == np.float32
-        else (t.Float64, np.float64)
+        (dr.llvm.Float, np.float32) if single else (dr.llvm.Float64, np.float64)
     )
-    flat = kind(np.ascontiguousarray(numbers, exact).reshape(-1))
-    return [dr.gather(kind, flat, lane * width + i) for i in range(width)]
+    return kind(np.ascontiguousarray(numbers, exact).reshape(-1))
 
 
-def smoothed(dr: Any, network: Network, around: Around, query: Query) -> Query:
-    """Normal and light as means over the samples around, see `facets`."""
+def read_row(dr: Any, numbers: Any, width: int, row: Lane) -> Lanes:
+    """A row in each lane, of a flat array of rows so wide."""
+    return [dr.gather(type(numbers), numbers, row * width + i) for i in range(width)]
+
+
+def around_table(dr: Any, network: Network, around: Around, lit: bool) -> Table:
+    """The samples around with their normals and, where asked for, light."""
     points, _, light = around
     position, normal, mask = map(np.asarray, points)
-    lit = [] if light is None or not query.light else [*np.asarray(light)]
-    columns = [position, normal, *lit]
-    table = make_table(dr, position, mask, columns, network.smooth)
+    columns = [position, normal, *(np.asarray(light) if lit else [])]
+    return make_table(dr, position, mask, columns, network.smooth)
+
+
+def smoothed(dr: Any, network: Network, table: Table, query: Query) -> Query:
+    """Normal and light as means over the samples around, see `facets`."""
     own = query.normal + [x for lanes in query.light for x in lanes]
     ends = query.place + query.normal
 

@@ -3,9 +3,9 @@
 Every weight is a number in the program, which is compiled anew for other weights.
 """
 
-from collections.abc import Iterable
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -17,22 +17,28 @@ from ginn_jax.network import EPSILON, SLOPE
 class Constants(NamedTuple):
     """Arrays that a program has inside, told apart by what is in them."""
 
+    tree: Any
     shapes: tuple[tuple[int, ...], ...]
     contents: tuple[bytes, ...]
 
 
-def as_constants(arrays: Iterable[Any]) -> Constants:
-    """Arrays of float32 as something that can be looked up."""
-    arrays = [np.asarray(a, np.float32) for a in arrays]
-    return Constants(tuple(a.shape for a in arrays), tuple(a.tobytes() for a in arrays))
+def as_constants(arrays: Any) -> Constants:
+    """A pytree of float32 arrays as something that can be looked up."""
+    leaves, tree = jax.tree.flatten(arrays)
+    leaves = [np.asarray(a, np.float32) for a in leaves]
+    shapes = tuple(a.shape for a in leaves)
+    return Constants(tree, shapes, tuple(a.tobytes() for a in leaves))
 
 
-def from_constants(constants: Constants) -> list[Float[np.ndarray, "..."]]:
+def from_constants(constants: Constants) -> Any:
     """The arrays."""
-    return [
-        np.frombuffer(content, np.float32).reshape(shape)
-        for shape, content in zip(*constants, strict=True)
-    ]
+    return jax.tree.unflatten(
+        constants.tree,
+        [
+            np.frombuffer(content, np.float32).reshape(shape)
+            for shape, content in zip(*constants[1:], strict=True)
+        ],
+    )
 
 
 def head(

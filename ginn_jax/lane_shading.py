@@ -15,16 +15,18 @@ from ginn_jax.lane_fields import (
     LONGEST,
     Query,
     Sum,
+    around_table,
     edge_products,
     field_sum,
     field_tables,
+    flat,
     lanes_usable,
-    read_rows,
+    read_row,
     safe_inverses,
     smoothed,
 )
-from ginn_jax.lane_layers import dot, head
-from ginn_jax.lanes import Lane, Lanes
+from ginn_jax.lane_layers import Constants, as_constants, dot, from_constants, head
+from ginn_jax.lanes import Lane, Lanes, Table, program
 from ginn_jax.network import Variables
 from ginn_jax.renderer import use_drjit
 from ginn_jax.shading import Encoded
@@ -73,49 +75,81 @@ def shade_in_lanes(
 ) -> Shaded:
     """f_2D at some rows (default: all) of these points, in any order."""
     dr = use_drjit()
-    t = dr.llvm
     count = len(position) if rows is None else len(rows)
     shape = () if encoded.scale is None else encoded.scale.shape
     if count == 0:
         return Shaded(np.zeros((0, *shape), np.float32), 0, False)
-    lane = dr.arange(t.UInt32, count)
+    numbers = ([] if a is None else [*np.asarray(a)] for a in (material, light))
+    own = [[np.asarray(position), np.asarray(normal)], *numbers]
+    asked = [[flat(dr, a) for a in arrays] for arrays in own]
+    sum_, free, *tables = _tables(dr, network, encoded, light is not None)
+    weights = as_constants(variables["shader"]["params"])
+    run = program(_shade, network, sum_, free, weights)
+    found = run(_lanes_of(dr, count, rows), asked, _units(dr, encoded), *tables)
+    values, pairs, doubtful = found
+    total, doubt = dr.sum(dr.llvm.UInt64(pairs)), dr.any(doubtful)
+    values = np.stack([value.numpy() for value in values], axis=-1)
+    return Shaded(values.reshape(count, *shape), int(total[0]), bool(doubt))
+
+
+def _lanes_of(dr: Any, count: int, rows: Int[np.ndarray, "M"] | None) -> Lane:
+    """The row of each lane."""
     if rows is not None:
-        lane = dr.gather(t.UInt32, t.UInt32(rows.astype(np.uint32)), lane)
-    query = _read_query(dr, lane, encoded, position, normal, material, light)
-    values, pairs = _shade(dr, network, variables, encoded, query)
-    doubtful = _doubtful(dr, query)
-    dr.eval(values, pairs, doubtful)
-    found = np.stack([value.numpy() for value in values], axis=-1)
-    total, doubt = dr.sum(t.UInt64(pairs)), dr.any(doubtful)
-    return Shaded(found.reshape(count, *shape), int(total[0]), bool(doubt))
+        return dr.llvm.UInt32(rows.astype(np.uint32))
+    lane = dr.arange(dr.llvm.UInt32, count)
+    dr.make_opaque(lane)
+    return lane
+
+
+def _units(dr: Any, encoded: Encoded) -> tuple[Any, Any, Any]:
+    """The centre, the units of light, and what light is multiplied by."""
+    t = dr.llvm
+    center = np.zeros(3) if encoded.center is None else np.asarray(encoded.center)
+    scale = np.ones(1) if encoded.scale is None else np.asarray(encoded.scale)
+    scale = scale.astype(np.float32)
+    center = t.Float64(center.astype(np.float64))
+    return center, t.Float(scale), t.Float(safe_inverses(scale))
+
+
+def _tables(
+    dr: Any, network: Network, encoded: Encoded, lit: bool
+) -> tuple[Sum, int, Lanes, Lanes | None]:
+    """What is summed, and how many features are free; the finest points with their
+    codes, and the samples around, to be searched."""
+    channels = _by_channel(encoded)
+    width = sum(a.shape[1] for a in channels[0])
+    sum_ = Sum(network.oriented, network.query.radius, 0.0, width, len(channels))
+    ends = encoded.points, np.asarray(encoded.area)
+    features = [a for parts in channels for a in parts]
+    (table,) = field_tables(dr, sum_, *ends, [features])
+    around = encoded.around
+    near = None if around is None else list(around_table(dr, network, around, lit))
+    return sum_, channels[0][0].shape[1], list(table), near
 
 
 def _read_query(
-    dr: Any,
-    lane: Lane,
-    encoded: Encoded,
-    position: Float[np.ndarray, "P 3"],
-    normal: Float[np.ndarray, "P 3"],
-    *numbers: Float[np.ndarray, "C P _"] | None,
+    dr: Any, network: Network, lane: Lane, asked: list[Lanes], center: Lane
 ) -> Query:
-    """What is known of the points with these numbers, counted from the centre."""
-    t = dr.llvm
-
-    def read(points: np.ndarray) -> Lanes:
-        return read_rows(dr, points, lane)
-
-    place = read(np.asarray(position))
-    if encoded.center is not None:
-        center = (dr.opaque(t.Float64, float(x)) for x in np.asarray(encoded.center))
-        place = [t.Float64(x) - c for x, c in zip(place, center, strict=True)]
-    place, directed = (
-        [t.Float(x) for x in lanes] for lanes in (place, read(np.asarray(normal)))
+    """What is known of the points in these rows, counted from the centre."""
+    single = dr.llvm.Float
+    ends, *numbers = asked
+    widths = network.materials, network.lights
+    place, normal = (read_row(dr, a, 3, lane) for a in ends)
+    exact = zip(map(dr.llvm.Float64, place), _entries(dr, center, 3), strict=True)
+    return Query(
+        [single(x - origin) for x, origin in exact],
+        [single(x) for x in normal],
+        *(
+            [[single(x) for x in read_row(dr, a, width, lane)] for a in arrays]
+            for arrays, width in zip(numbers, widths, strict=True)
+        ),
     )
-    material, light = (
-        [] if a is None else [[t.Float(x) for x in read(c)] for c in np.asarray(a)]
-        for a in numbers
-    )
-    return Query(place, directed, material, light)
+
+
+def _entries(dr: Any, numbers: Any, count: int) -> Lanes:
+    """Numbers that all lanes share."""
+    index = map(dr.llvm.UInt32, range(count))
+    return [dr.gather(type(numbers), numbers, i) for i in index]
 
 
 def _doubtful(dr: Any, query: Query) -> Lane:
@@ -133,46 +167,35 @@ def _doubtful(dr: Any, query: Query) -> Lane:
 
 
 def _shade(
-    dr: Any, network: Network, variables: Variables, encoded: Encoded, query: Query
-) -> tuple[Lanes, Lane]:
-    """The value of every channel, and the number of pairs."""
-    params = variables["shader"]["params"]
-    scale = [1.0] if encoded.scale is None else np.asarray(encoded.scale).tolist()
-    if encoded.around is not None:
-        query = smoothed(dr, network, encoded.around, query)
-    summed, pairs = _convolved(dr, network, params[network.query.name], encoded, query)
-    inverses = safe_inverses(np.array(scale, np.float32)).tolist()
+    dr: Any,
+    network: Network,
+    sum_: Sum,
+    free: int,
+    weights: Constants,
+    lane: Lane,
+    asked: list[Lanes],
+    units: tuple[Any, Any, Any],
+    table: Lanes,
+    around: Lanes | None,
+) -> tuple[Lanes, Lane, Lane]:
+    """The value of every channel, the number of pairs, and whether to check."""
+    params = from_constants(weights)
+    query = _read_query(dr, network, lane, asked, units[0])
+    doubtful = _doubtful(dr, query)
+    if around is not None:
+        query = smoothed(dr, network, Table(*around), query)
+    kernel, ends = params[network.query.name]["kernel"], query.place + query.normal
+    totals, pairs = field_sum(dr, sum_, kernel, Table(*table), ends)
+    shared = (_entries(dr, numbers, sum_.channels) for numbers in units[1:])
     values = []
-    for channel, unit in enumerate(scale):
-        inverse = dr.opaque(dr.llvm.Float, inverses[channel])
+    for channel, (unit, inverse) in enumerate(zip(*shared, strict=True)):
         light = [x * inverse for x in query.light[channel]] if query.light else []
         own = query.normal + (query.material[channel] if query.material else [])
-        free, beams = (part[channel] for part in summed)
-        beams = None if encoded.code.light is None else beams
-        value = head(dr, network, params, free, beams, own, light)
-        values.append(
-            value if encoded.scale is None else value * dr.opaque(dr.llvm.Float, unit)
-        )
-    return values, pairs
-
-
-def _convolved(
-    dr: Any, network: Network, params: Any, encoded: Encoded, query: Query
-) -> tuple[tuple[list[Lanes], list[Lanes]], Lane]:
-    """Free features and beams of every channel summed around the query, and how many
-    points of the cloud are there."""
-    channels = _by_channel(encoded)
-    free, width = channels[0][0].shape[1], sum(a.shape[1] for a in channels[0])
-    radius = network.query.radius
-    sum_ = Sum(network.oriented, radius, 0.0, width, len(channels))
-    features = [a for parts in channels for a in parts]
-    ends = encoded.points, np.asarray(encoded.area)
-    (table,) = field_tables(dr, sum_, *ends, [features])
-    kernel = [np.asarray(a) for a in params["kernel"]]
-    ends = query.place + query.normal
-    totals, pairs = field_sum(dr, sum_, kernel, table, ends)
-    rows = [totals[i : i + width] for i in range(0, len(totals), width)]
-    return ([row[:free] for row in rows], [row[free:] for row in rows]), pairs
+        row = totals[channel * sum_.width : (channel + 1) * sum_.width]
+        beams = row[free:] if free < sum_.width else None
+        value = head(dr, network, params, row[:free], beams, own, light)
+        values.append(value * unit)
+    return values, pairs, doubtful
 
 
 def _by_channel(encoded: Encoded) -> list[list[Float[np.ndarray, "N _"]]]:
