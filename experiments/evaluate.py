@@ -47,7 +47,6 @@ from ginn_jax.compare_pictures import (
 )
 from ginn_jax.compare_screen import screen_pictures
 from ginn_jax.compare_tracing import traced_rows, with_reference
-from ginn_jax.dataset import count_given
 from ginn_jax.evaluate import Row, at_scale
 from ginn_jax.experiment import make
 from ginn_jax.lit_clouds import Cloud
@@ -150,7 +149,7 @@ def main(options: Options) -> dict[str, Any]:
         scene, networks = compare_scene(options, settings, source, cloud, networks)
         found.append(scene)
     for name, row in at_points.items():
-        row["memory_mib"] = network_memory(networks[name], count_given(settings.points))
+        row["memory_mib"] = network_memory(networks[name], points_given(clouds[0])[0])
     metrics = summary(options, at_points, found, names)
     shown = [(n, scene.shown) for n, scene in zip(names, found, strict=True)]
     compare_figures.draw_methods(options.out / "ablation.png", shown[:4])

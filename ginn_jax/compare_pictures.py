@@ -22,8 +22,10 @@ from ginn_jax.compare_networks import (
 )
 from ginn_jax.dataset import count_given
 from ginn_jax.evaluate import Row, View, at_scale
-from ginn_jax.inference import encode_whole
+from ginn_jax.inference import encode_cloud, encode_whole
+from ginn_jax.lane_encoding import encodes_in_lanes
 from ginn_jax.lane_shading import lanes_for
+from ginn_jax.lanes import most_held_mib
 from ginn_jax.limits import only, without
 from ginn_jax.lit_clouds import Cloud, LitCloud, mean_light, points_of, split_points
 from ginn_jax.neighbors import bucket
@@ -31,6 +33,7 @@ from ginn_jax.objects import Source
 from ginn_jax.process import on_cpu, spare_memory_maps
 from ginn_jax.receptive_field import Oriented
 from ginn_jax.scenes import Occlusion, Settings
+from ginn_jax.shading import Encoded
 
 
 def points_given(cloud: Any) -> tuple[Any, np.ndarray | None]:
@@ -157,13 +160,24 @@ def codes_kept(row: Row) -> Row:
     return row | {"method": name, "seconds": row["seconds_2d"], "kept": 1}
 
 
-def network_memory(trained: Trained, points: int) -> float:
-    """Scratch memory of f_3D on so many points and of f_2D on a block on every device.
+def _encode(trained: Trained, cloud: Cloud) -> Encoded:
+    network, limits, model = trained
+    if isinstance(cloud, LitCloud):
+        return evaluate_light.encode_lit(network, limits, model, cloud)[0]
+    ends = model.variables, cloud.position, cloud.normal
+    return encode_cloud(network, limits, *ends, key=model.key)[0]
 
-    What f_3D hands to f_2D is counted, inputs and outputs are not. In lanes f_2D keeps
-    little more than a copy of that.
+
+def network_memory(trained: Trained, cloud: Cloud) -> float:
+    """Memory in MiB that f_3D of a cloud and f_2D take beside inputs and outputs; what
+    f_3D hands to f_2D is counted.
+
+    By JAX it is what programs ask for, f_2D's on a block on every device. In lanes it
+    is the most that f_3D holds at a time (but for layers of rows, which hold less);
+    f_2D keeps little more than a copy of what it is handed.
     """
     network, limits, model = trained
+    points = len(cloud.position)
 
     def shapes(rows: int, asked: bool) -> Any:
         place = jax.ShapeDtypeStruct((rows, 3), np.float32)
@@ -177,14 +191,17 @@ def network_memory(trained: Trained, points: int) -> float:
 
     deep = network, without(limits, network.query.name)
     given = model.variables, *shapes(bucket(points), True), None, model.key
-    compiled = encode_whole.lower(*deep, *given).compile()
     encoded, _ = jax.eval_shape(partial(encode_whole, *deep), *given)
-    kept = sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(encoded.code))
+    kept = sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(encoded.code)) / 2**20
+    if encodes_in_lanes(network):
+        held = most_held_mib(lambda: _encode(trained, cloud))
+    else:
+        held = scratch_mib(encode_whole.lower(*deep, *given).compile()) + kept
     if lanes_for(network):
-        return scratch_mib(compiled) + kept / 2**20
+        return held
     flat = network, only(limits, network.query.name), on_cpu(), model.variables
     rows = largest_block(encoded.scale is not None)
     turn = turn_shapes(Turn(*shapes(rows, network.asks == "all")))
     shaded = shade_turn.lower(*flat, encoded, turn).compile()
     blocks = len(jax.devices()) * scratch_mib(shaded)
-    return max(scratch_mib(compiled), blocks) + kept / 2**20
+    return max(held, blocks + kept)

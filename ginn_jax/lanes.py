@@ -6,6 +6,7 @@ near: no list, hence no capacity. Dr.Jit, which compiles the ray tracer, compile
 """
 
 import functools
+import tracemalloc
 from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple
 
@@ -41,6 +42,21 @@ def program(function: Callable[..., Any], *static: Hashable) -> Callable[..., An
         return function(dr, *static, *arrays)
 
     return dr.freeze(run, warn_after=NEVER)
+
+
+def most_held_mib(call: Callable[[], Any]) -> float:
+    """The most memory that NumPy and Dr.Jit hold at a time for that call."""
+    dr = use_drjit()
+    call()  # so that nothing is compiled
+    dr.sync_thread()
+    dr.detail.malloc_clear_statistics()
+    tracemalloc.start()
+    try:
+        call()
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    return (most + dr.detail.malloc_watermark(dr.JitBackend.LLVM)) / 2**20
 
 
 class Table(NamedTuple):
