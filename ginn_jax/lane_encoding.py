@@ -29,6 +29,7 @@ from ginn_jax.lane_fields import (
     read_row,
     safe_inverses,
     smoothed,
+    write_row,
 )
 from ginn_jax.lane_layers import Constants, as_constants, from_constants
 from ginn_jax.lanes import Lane, Lanes, Table, program
@@ -239,9 +240,5 @@ def _convolved(
 ) -> Any:
     """The sums, row after row, written where there is nothing yet."""
     totals, _ = field_sum(dr, sum_, from_constants(kernel), Table(*table), ends)
-    lane = dr.arange(dr.llvm.UInt32, dr.width(ends[0]))
-    for i, total in enumerate(totals):
-        place = lane * len(totals) + i
-        # One after the other they would be as many programs.
-        dr.scatter(blank, total, place, mode=dr.ReduceMode.Permute)
+    write_row(dr, blank, totals, dr.arange(dr.llvm.UInt32, dr.width(ends[0])))
     return blank

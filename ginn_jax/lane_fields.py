@@ -79,6 +79,14 @@ def read_row(dr: Any, numbers: Any, width: int, row: Lane) -> Lanes:
     return [dr.gather(type(numbers), numbers, row * width + i) for i in range(width)]
 
 
+def write_row(dr: Any, blank: Any, row: Lanes, lane: Lane) -> None:
+    """A row from each lane, to where there is nothing yet."""
+    for i, number in enumerate(row):
+        place = lane * len(row) + i
+        # All at once: one after the other they would be as many programs.
+        dr.scatter(blank, number, place, mode=dr.ReduceMode.Permute)
+
+
 def around_table(dr: Any, network: Network, around: Around, lit: bool) -> Table:
     """The samples around with their normals and, where asked for, light."""
     points, _, light = around

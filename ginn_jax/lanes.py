@@ -46,17 +46,18 @@ def program(function: Callable[..., Any], *static: Hashable) -> Callable[..., An
 
 def most_held_mib(call: Callable[[], Any]) -> float:
     """The most memory that NumPy and Dr.Jit hold at a time for that call."""
-    dr = use_drjit()
+    dr, backend = use_drjit(), use_drjit().JitBackend.LLVM
     call()  # so that nothing is compiled
     dr.sync_thread()
     dr.detail.malloc_clear_statistics()
+    held = dr.detail.malloc_watermark(backend)  # by others, as the ray tracer
     tracemalloc.start()
     try:
         call()
         _, most = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    return (most + dr.detail.malloc_watermark(dr.JitBackend.LLVM)) / 2**20
+    return (most + dr.detail.malloc_watermark(backend) - held) / 2**20
 
 
 class Table(NamedTuple):
