@@ -173,6 +173,7 @@ def blocks_call(
 ) -> tuple[Callable[[], Any], Limits]:
     """f_2D in blocks, as a GPU runs it, to pixels and their values; limits that fit."""
     surface = Surface(gbuffer.position, gbuffer.normal, gbuffer.mask)
+    encoded = block_shading.searchable(network, encoded)
 
     def shade(limits: Limits) -> tuple[np.ndarray, np.ndarray, Limits]:
         given = network, encoded.center, surface, (None, None)
@@ -189,6 +190,7 @@ def block_memory(
 ) -> int:
     """Scratch memory of one block of f_2D, the same for every image, in bytes."""
     rows = blocks.largest_block(lit=False)
+    encoded = block_shading.searchable(network, encoded)
     zeros = np.zeros((rows, 3), np.float32)
     queries = Oriented(zeros, zeros, np.ones(rows, bool))
     flat = only(limits, network.query.name)

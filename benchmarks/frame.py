@@ -126,7 +126,8 @@ def programs(
     _, pixels, coherent = pixels_in_order(network, encoded.center, surface, numbers)
     turns = make_turns(encoded.scale is not None, encoded.center, *pixels)
     turns = [each_its_own(turn) for turn in turns]
-    given = network, everywhere(variables), encoded, turns, coherent, limits
+    ready = everywhere(block_shading.searchable(network, encoded))
+    given = network, everywhere(variables), ready, turns, coherent, limits
     return partial(block_shading.shade_turns, *given)
 
 
@@ -174,8 +175,8 @@ def write_report(options: Options, cases: list[dict[str, Any]]) -> str:
     return f"""# Whole frames
 
 {size} x {size}, foreground pixels only; median of {options.repeats} calls ± half the
-interquartile range. f_3D and f_2D from NumPy arrays to NumPy arrays (f_2D in lanes on a
-CPU, in blocks on a GPU); "programs" are f_2D's in blocks with all they need on the
+interquartile range. f_3D and f_2D from NumPy arrays to NumPy arrays (in lanes on a CPU,
+by JAX on a GPU); "programs" are f_2D's in blocks with all they need on the
 device and results left there. Rendering and light apart.
 "Compiling" is the time until both had run once in limits that suffice. The paper's
 whole network: 1024 x 1024, NVIDIA GTX 1080.

@@ -74,7 +74,7 @@ def over_points(options: Options, scene: reference.Scene) -> list[dict[str, Any]
         network = network_for(count)
         variables = weights_of(network)
         cloud = sample_surface(scene.mesh, count, seed=0)
-        # Too small for anything, so that it is measured: loose levels cost time.
+        # Too small for anything, so that JAX has it measured: loose levels cost time.
         limits = uniform_limits(network, 64)
         arguments = variables, cloud.position, cloud.normal
         key = jax.random.key(0)

@@ -30,7 +30,8 @@ def sort_into_cells(position: Float[np.ndarray, "N 3"], radius: float) -> Cells:
     low, high = along.min(axis=1), along.max(axis=1)
     extent = high.astype(np.float64) - low
     width = max((1 + MARGIN) * radius, extent.max() / LONGEST)
-    while np.prod(np.floor(extent / width) + 1) > MOST:
+    most = max(MOST, 8 * len(position))
+    while np.prod(np.floor(extent / width) + 1) > most:
         width *= 1.25
     rate = np.float32(1 / width)
     x, y, z = ((along - low[:, None]) * rate).astype(np.int32)

@@ -161,6 +161,7 @@ def codes_kept(row: Row) -> Row:
 
 
 def _encode(trained: Trained, cloud: Cloud) -> Encoded:
+    """f_3D of a cloud."""
     network, limits, model = trained
     if isinstance(cloud, LitCloud):
         return evaluate_light.encode_lit(network, limits, model, cloud)[0]
@@ -196,12 +197,12 @@ def network_memory(trained: Trained, cloud: Cloud) -> float:
     if encodes_in_lanes(network):
         held = most_held_mib(lambda: _encode(trained, cloud))
     else:
-        held = scratch_mib(encode_whole.lower(*deep, *given).compile()) + kept
+        held = scratch_mib(encode_whole.lower(*deep, *given).compile())
     if lanes_for(network):
-        return held
+        return held + kept
     flat = network, only(limits, network.query.name), on_cpu(), model.variables
     rows = largest_block(encoded.scale is not None)
     turn = turn_shapes(Turn(*shapes(rows, network.asks == "all")))
     shaded = shade_turn.lower(*flat, encoded, turn).compile()
     blocks = len(jax.devices()) * scratch_mib(shaded)
-    return max(held, blocks + kept)
+    return max(held, blocks) + kept

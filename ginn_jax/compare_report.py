@@ -130,8 +130,8 @@ Cells that our network loses against screen space of either kind, 2D only or 3D 
 
 Same pixels, same machine, one method after the other, medians of three calls after a
 first one; compilation, G-buffer and direct light apart, and the samples of the surface:
-{ours["seconds_sampling"]:.2g} s, once for all views of a scene. Memory is what the
-compiled functions ask for beside their inputs and outputs.
+{ours["seconds_sampling"]:.2g} s, once for all views of a scene. Memory is what
+methods ask for beside inputs and outputs.
 
 {report.table_of(m["results"], times)}
 f_2D takes {m["share_2d"]:.0%} of our network's time (paper: 60 %).

@@ -150,7 +150,7 @@ def center_of(position: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "3"]:
     nothing is rounded when float32 coordinates are counted from there.
     """
     # Ten times as fast along rows of memory as across.
-    along = np.ascontiguousarray(position.T)
+    along = np.ascontiguousarray(np.asarray(position).T)
     low, high = (f(along, axis=1).astype(np.float64) for f in (np.min, np.max))
     size = max(float((high - low).max()), float(np.finfo(np.float32).tiny))
     unit = 2.0 ** (2 + np.ceil(np.log2(size)))

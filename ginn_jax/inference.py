@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from ginn_jax.architecture import Network
-from ginn_jax.block_shading import shade_blocks
+from ginn_jax.block_shading import searchable, shade_blocks
 from ginn_jax.blocks import everywhere, pad_channels, pad_points
 from ginn_jax.checks import channels_alike, numbers_of, unit_rows
 from ginn_jax.dataset import center_of, relative_to
@@ -51,7 +51,11 @@ def encode_cloud(
     *,
     key: Key[Array, ""],
 ) -> tuple[Encoded, Limits]:
-    """Codes of a cloud, on all devices, and the limits that sufficed.
+    """Codes of a cloud, and the limits that sufficed.
+
+    Where f_3D runs in lanes they stay in NumPy's memory and in no grid, and need no
+    limits: `block_shading.searchable` readies them for `shading.shade`. Else they are
+    on all devices.
 
     In an animation, samples that move with their surface, give what the frame before
     `kept` (`nothing_kept` before the first): levels then change as little as they can,
@@ -78,7 +82,10 @@ def encode_cloud(
         whole = Oriented(place, np.asarray(normal, np.float32), mask)
         given = whole, as_float(material), as_float(light), kept_before
         encoded = encode_in_lanes(network, variables, *given, key=key)
-        return encoded._replace(center=center), limits
+        kept = encoded.kept
+        if not lanes_for(network):
+            encoded = everywhere(searchable(network, encoded._replace(kept=None)))
+        return encoded._replace(center=center, kept=kept), limits
     cloud = pad_points(center, position, normal, rows)
     more = pad_channels(material, rows), pad_channels(light, rows)
 

@@ -88,6 +88,8 @@ def sample_disk_in_lanes(
         everyone = np.arange(len(lot))
         return cells.order[_elect(dr, disk, cells, darts, everyone)]
     early = lot.take(cells.order) < (HALF if disk.moved else QUARTER)
+    if not early.any():  # none was kept before
+        early = lot.take(cells.order) < HALF + QUARTER // 2
     first = _elect(dr, disk, cells, darts, np.flatnonzero(early))
     late = np.flatnonzero(~early)
     if len(first) and len(late):
@@ -113,6 +115,7 @@ def _elect(
     waiting, enough = np.arange(len(rows)), WAITING
     while len(waiting):
         asked = order[waiting]
+        # Done once it returns: until then Dr.Jit reads the memory of the state.
         state[waiting] = _judge(dr, disk, darts, target, state, asked, enough)
         waiting, enough = waiting[state[waiting] == WAITING], KEPT
     return rows[state == KEPT]

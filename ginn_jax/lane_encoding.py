@@ -72,6 +72,7 @@ def encode_in_lanes(
 ) -> Encoded:
     """`shading.encode` of a cloud without padding; only names go up to the next bucket.
 
+    Everything is in NumPy's memory and checked by the caller, `kept_before` as there.
     The finest points come in an order of their own, and in no grid.
     """
     dr, count = use_drjit(), len(cloud.mask)
@@ -79,7 +80,9 @@ def encode_in_lanes(
     lots = [_lots(bucket(count), i, key) for i in range(len(network.levels))]
     before = None if kept_before is None else np.asarray(kept_before)
     rows = levels_in_lanes(dr, network, cloud.position, cloud.normal, lots, before)
-    around = Around(cloud, None, light) if network.smooth else None
+    # Copied: the caller may write on.
+    kept = jax.tree.map(np.array, (cloud, light)) if network.smooth else None
+    around = None if kept is None else Around(kept[0], None, kept[1])
     material, given = (_take(a, rows[0]) for a in (material, light))
     if around is not None:
         cloud, given = _smooth(dr, network, around, rows[0], given)

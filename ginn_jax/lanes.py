@@ -45,10 +45,12 @@ def program(function: Callable[..., Any], *static: Hashable) -> Callable[..., An
 
 
 def most_held_mib(call: Callable[[], Any]) -> float:
-    """The most memory that NumPy and Dr.Jit hold at a time for that call."""
-    dr, backend = use_drjit(), use_drjit().JitBackend.LLVM
+    """The most memory that NumPy holds at a time for that call, and Dr.Jit."""
+    dr = use_drjit()
+    backend = dr.JitBackend.LLVM
     call()  # so that nothing is compiled
     dr.sync_thread()
+    dr.flush_malloc_cache()  # which counts as held
     dr.detail.malloc_clear_statistics()
     held = dr.detail.malloc_watermark(backend)  # by others, as the ray tracer
     tracemalloc.start()

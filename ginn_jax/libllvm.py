@@ -70,6 +70,6 @@ def use_libllvm() -> None:
 def llvm_missing(found: str) -> InputError:
     """The error to raise where only `found` is there."""
     return InputError(
-        f"ray tracing, and f_2D in lanes, need libLLVM >= {OLDEST_LLVM} "
+        f"ray tracing, and networks in lanes, need libLLVM >= {OLDEST_LLVM} "
         f"(found: {found}): `apt-get install libllvm19` or `brew install llvm`"
     )

@@ -1,5 +1,5 @@
 """Mitsuba, the ray tracer behind every reference, and Dr.Jit, which compiles it and
-f_2D on a CPU: imported on first use, here alone."""
+networks on a CPU: imported on first use, here alone."""
 
 import ctypes
 import functools

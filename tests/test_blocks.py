@@ -29,6 +29,7 @@ cloud, queries = cases.lit(1000, 1, (8.0, 1.3)), cases.lit(700, 2, (8.0, 1.3))
 
 # Three turns, the last with a block that is half empty.
 ends = variables, cloud.position, cloud.normal, *network_numbers(cloud)
+inference.encodes_in_lanes = lambda network: False
 encoded, _ = inference.encode_cloud(network, limits, *ends, key=cases.KEY)
 asked = queries.position, queries.normal, *network_numbers(queries)
 found = block_shading.shade_blocks(network, limits, variables, encoded, *asked)[0]

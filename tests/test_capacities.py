@@ -202,7 +202,7 @@ def test_host_calls_find_room_and_drop_nothing(in_blocks, monkeypatch, caplog):
     assert (len(deep), len(flat)) == (again[0] + 1, again[1] + 1)
 
 
-def test_one_stage_without_room_does_not_swell_the_others(monkeypatch):
+def test_one_stage_without_room_does_not_swell_the_others(monkeypatch, in_blocks):
     """A Poisson disk that misses edges keeps points in crowds, with edges in crowds."""
     calls = counted(monkeypatch, inference, "encode_whole")
     network, roomy = tiny.ONE_LEVEL, dict(tiny.ONE_LEVEL_LIMITS.sizes)

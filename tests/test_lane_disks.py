@@ -39,11 +39,12 @@ def thrown(position, normal, lot, name, before, sided, moved):
         conflict = False
         for k in kept:
             facing = normal[i] @ normal[k]
+            near = RADIUS * (0.6 if moved and before[i] and before[k] else 1)
+            if distance(position[i], position[k]) >= near:
+                continue
             if sided and abs(facing) < 1e-5:
                 return None, lot
-            near = RADIUS * (0.6 if moved and before[i] and before[k] else 1)
-            apart = distance(position[i], position[k]) >= near
-            conflict |= not apart and not (sided and facing < 0)
+            conflict |= not (sided and facing < 0)
         if not conflict:
             kept.append(i)
     return sorted(kept), lot

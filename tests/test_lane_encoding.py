@@ -9,7 +9,7 @@ import tiny
 from test_lane_shading import NETWORKS, OTHERS, case
 from test_relight import lit
 
-from ginn_jax import inference, lane_encoding, presets
+from ginn_jax import inference, lane_disks, lane_encoding, presets
 from ginn_jax.lit_clouds import network_numbers
 from ginn_jax.searches import uniform_limits
 
@@ -86,7 +86,10 @@ def test_lanes_encode_what_jax_encodes(name):
     assert_alike(given[0], encode(*given), encode(*given, in_lanes=False))
 
 
-def test_what_was_kept_before_is_kept_again():
+@pytest.mark.parametrize("few", [1, 1 << 12])
+def test_what_was_kept_before_is_kept_again(few, monkeypatch):
+    """Thrown in two waves, and at once."""
+    monkeypatch.setattr(lane_disks, "FEW", few)
     network, variables, cloud, numbers = scene("occlusion")
     before = inference.nothing_kept(network, 1500)
     before[:, :1500:7] = True
@@ -96,6 +99,16 @@ def test_what_was_kept_before_is_kept_again():
     again = encode(*given[:4], found.kept)
     np.testing.assert_array_equal(again.kept, found.kept)
     assert (encode(*given[:4]).kept != found.kept).any()
+
+
+def test_nothing_kept_before_changes_no_codes():
+    network, variables, cloud, numbers = scene("occlusion")
+    given = network, variables, cloud, numbers
+    nothing = inference.nothing_kept(network, 1500)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lane_disks, "FEW", 1)
+        found = encode(*given, nothing)
+    np.testing.assert_array_equal(found.kept, encode(*given).kept)
 
 
 @pytest.mark.parametrize("count", [1, 2, 70])
