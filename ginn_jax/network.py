@@ -132,8 +132,33 @@ class McConv(nn.Module):
         return Code(found[:, :width], None if light is None else found[:, width:])
 
 
+def latent_layers(
+    network: Network,
+    train: bool,
+    x: Code,
+    light: Float[Array, "N L"] | None,
+    mask: Bool[Array, "N"],
+) -> Code:
+    """The code of a point, from its features after the last convolution of f_3D.
+
+    To be called by a module, whose layers these are.
+    """
+    free = x.free
+    if network.encoder:
+        free = Norm(network.norm, train)(free, mask)
+    free = dense(network.latent, name="latent")(free)
+    free = Norm(network.norm, train)(free, mask)
+    beams = []
+    if x.light is not None:
+        width = network.beams or network.latent
+        beams = [Gate(width, name="latent_light")(free, x.light)]
+    if network.local and light is not None:
+        beams = [light, *beams]
+    return Code(free, jnp.concatenate(beams, axis=1) if beams else None)
+
+
 class Latent(nn.Module):
-    """The code of a point, from its features after the last convolution of f_3D."""
+    """The last layers of `Encoder` alone."""
 
     network: Network
     train: bool
@@ -142,19 +167,7 @@ class Latent(nn.Module):
     def __call__(
         self, x: Code, light: Float[Array, "N L"] | None, mask: Bool[Array, "N"]
     ) -> Code:
-        network = self.network
-        free = x.free
-        if network.encoder:
-            free = Norm(network.norm, self.train)(free, mask)
-        free = dense(network.latent, name="latent")(free)
-        free = Norm(network.norm, self.train)(free, mask)
-        beams = []
-        if x.light is not None:
-            width = network.beams or network.latent
-            beams = [Gate(width, name="latent_light")(free, x.light)]
-        if network.local and light is not None:
-            beams = [light, *beams]
-        return Code(free, jnp.concatenate(beams, axis=1) if beams else None)
+        return latent_layers(self.network, self.train, x, light, mask)
 
 
 class Encoder(nn.Module):
@@ -180,9 +193,7 @@ class Encoder(nn.Module):
             if conv.skip is not None:
                 x = join(done[conv.skip], x)
             done[conv.name] = x
-        latent = Latent(network, self.train)
-        nn.share_scope(self, latent)
-        return latent(x, light, levels[0].mask)
+        return latent_layers(network, self.train, x, light, levels[0].mask)
 
 
 def splat(values: Float[Array, "N"], field: Field, receivers: int) -> Float[Array, "M"]:
