@@ -31,7 +31,7 @@ LIMITS = uniform_limits(NETWORK, 1 << 14)
 POINTS, QUERIES = 400, 200
 WEIGHTS = np.random.default_rng(2).normal(size=(1, QUERIES)).astype(np.float32)
 # How far each is moved at most; a pair that crosses a sharp border there adds a jump.
-NEAR, SMOOTH = (3e-5, 1e-5, 3e-6), (1e-1, 1e-2, 1e-3)
+NEAR, SMOOTH = (3e-5, 1e-5, 3e-6), (1e-1, 3e-2, 1e-2, 1e-3)
 STEPS = {
     "position": NEAR,
     "normal": SMOOTH,
@@ -63,7 +63,12 @@ def given():
 def shaded():
     """What the network makes of the queries."""
     config = replace(tiny.CONFIG, network=NETWORK)
-    variables = jax.tree.map(np.asarray, train.init_state(config).variables)
+    rng = np.random.default_rng(4)
+    # Of a network at its beginning some gradients are hardly more than rounding.
+    variables = jax.tree.map(
+        lambda a: np.float32(a + 0.3 * rng.standard_normal(a.shape)),
+        jax.device_get(train.init_state(config).variables),
+    )
 
     def values(position, normal, material, light, *queries):
         cloud = points_of(position, normal)
