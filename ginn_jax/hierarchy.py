@@ -109,12 +109,12 @@ def choose_among(
 
 
 def thrown_first(
-    lot: UInt32[Array, "N"], kept_before: Bool[Array, "N"] | None
-) -> UInt32[Array, "N"]:
+    lot: UInt32[Any, "N"], kept_before: Bool[Any, "N"] | None
+) -> UInt32[Any, "N"]:
     """Lots with which points that were kept before come before all others."""
     if kept_before is None:
         return lot
-    return lot >> 1 | jnp.where(kept_before, jnp.uint32(0), jnp.uint32(1 << 31))
+    return lot >> 1 | (~kept_before).astype(np.uint32) << 31
 
 
 def conflicts(

@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float, Int, UInt32
 
 from ginn_jax.architecture import Network
 from ginn_jax.cells import Cells, aligned, sort_into_cells, thinned
-from ginn_jax.hierarchy import DROPPED, HOLD, KEPT, WAITING
+from ginn_jax.hierarchy import DROPPED, HOLD, KEPT, WAITING, thrown_first
+from ginn_jax.lane_fields import flat
 from ginn_jax.lanes import (
     COLUMNS,
     Lane,
@@ -61,9 +62,8 @@ def levels_in_lanes(
     levels, rows = [], np.arange(len(position))
     moved = kept_before is not None
     for i, radius in enumerate(network.levels):
-        lot = np.asarray(lots[i])[rows]
-        if kept_before is not None:
-            lot = lot >> 1 | np.where(kept_before[i, rows], 0, HALF).astype(np.uint32)
+        before = None if kept_before is None else kept_before[i, rows]
+        lot = thrown_first(np.asarray(lots[i])[rows], before)
         ends = position.take(rows, 0), normal.take(rows, 0), lot, rows
         disk = Disk(radius, network.sided, moved)
         rows = rows[sample_disk_in_lanes(dr, disk, *ends)]
@@ -81,8 +81,8 @@ def sample_disk_in_lanes(
 ) -> Int[np.ndarray, "K"]:
     """The rows that `hierarchy.sample_disk` keeps, in the order of their cells."""
     t, name = dr.llvm, name.astype(np.uint32)
-    flat = (t.Float(np.ascontiguousarray(a).reshape(-1)) for a in (position, normal))
-    darts = Darts(position, normal, lot, name, [*flat, t.UInt32(lot), t.UInt32(name)])
+    lanes = flat(dr, position), flat(dr, normal), t.UInt32(lot), t.UInt32(name)
+    darts = Darts(position, normal, lot, name, [*lanes])
     cells = sort_into_cells(position, disk.radius)
     if len(lot) < FEW:
         everyone = np.arange(len(lot))

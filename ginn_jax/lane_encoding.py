@@ -16,7 +16,6 @@ from ginn_jax.facets import Around
 from ginn_jax.hierarchy import draw_lots
 from ginn_jax.lane_disks import levels_in_lanes
 from ginn_jax.lane_fields import (
-    LONGEST,
     Query,
     Sum,
     areas,
@@ -25,9 +24,9 @@ from ginn_jax.lane_fields import (
     field_sum,
     field_tables,
     flat,
-    lanes_usable,
     read_row,
     safe_inverses,
+    simple_enough,
     smoothed,
     write_row,
 )
@@ -52,12 +51,12 @@ def encodes_in_lanes(network: Network) -> bool:
     """Whether f_3D of that network runs in lanes here: on a CPU with a libLLVM, unless
     it mixes, or has the paper's density for each pair, batch norms or very wide layers.
     """
-    simple = network.density == "surface" and network.norm != "batch"
-    simple &= not any(conv.mixes for conv in network.encoder)
+    if any(conv.mixes for conv in network.encoder):
+        return False
     # In light's width, which is no less than that of any feature; at once.
     widest = [2 * conv.channels + network.beams for conv in network.encoder]
     longest = edge_products(network, max(widest, default=1), 1)
-    return simple and longest <= LONGEST and lanes_usable()
+    return simple_enough(network, longest)
 
 
 def encode_in_lanes(
@@ -91,7 +90,7 @@ def encode_in_lanes(
         scale = (light[..., 0] / np.float32(count)).sum(axis=1)
         given = given * safe_inverses(scale)[:, None, None]
     levels = [Oriented(*(a.take(some, 0) for a in cloud)) for some in rows]
-    lanes = [_lanes_of(dr, level) for level in levels]
+    lanes = [_ends_of(dr, level) for level in levels]
     area = _areas(dr, network, levels, lanes)
     normal = _padded(levels[0].normal)
     own = normal, _padded(material), _padded(given)
@@ -131,7 +130,7 @@ def _padded(numbers: Float[np.ndarray, "*C N K"] | None) -> Any:
     return np.pad(numbers, [(0, 0)] * (numbers.ndim - 2) + [(0, missing), (0, 0)])
 
 
-def _lanes_of(dr: Any, points: Oriented) -> Lanes:
+def _ends_of(dr: Any, points: Oriented) -> Lanes:
     """Position and normal of a point in each lane."""
     lane = dr.arange(dr.llvm.UInt32, len(points.mask))
     ends = [x for a in points[:2] for x in read_row(dr, flat(dr, a), 3, lane)]

@@ -43,6 +43,13 @@ def lanes_usable() -> bool:
     return True
 
 
+def simple_enough(network: Network, products: int) -> bool:
+    """Whether parts of that network with programs so long run in lanes here: neither
+    the paper's density for each pair nor batch norms do."""
+    simple = network.density == "surface" and network.norm != "batch"
+    return simple and products <= LONGEST and lanes_usable()
+
+
 def edge_products(network: Network, width: int, colours: int) -> int:
     """About how many multiplications an edge takes: each weight stands in a program."""
     group = network.group or width

@@ -12,7 +12,6 @@ from jaxtyping import Float, Int
 from ginn_jax.architecture import Network
 from ginn_jax.checks import LARGEST
 from ginn_jax.lane_fields import (
-    LONGEST,
     Query,
     Sum,
     around_table,
@@ -20,9 +19,9 @@ from ginn_jax.lane_fields import (
     field_sum,
     field_tables,
     flat,
-    lanes_usable,
     read_row,
     safe_inverses,
+    simple_enough,
     smoothed,
 )
 from ginn_jax.lane_layers import Constants, as_constants, dot, from_constants, head
@@ -46,9 +45,8 @@ def lanes_for(network: Network) -> bool:
     """Whether that f_2D runs in lanes here: on a CPU with a libLLVM, unless it splats,
     or has the paper's density for each pair, batch norms or very wide layers."""
     plain = network.query.before == "raw" and not network.query.mixes
-    simple = network.density == "surface" and network.norm != "batch"
-    possible = plain and simple and not network.splat
-    return possible and _products(network) <= LONGEST and lanes_usable()
+    possible = plain and not network.splat
+    return possible and simple_enough(network, _products(network))
 
 
 def _products(network: Network) -> int:
