@@ -28,7 +28,8 @@ def sort_into_cells(position: Float[np.ndarray, "N 3"], radius: float) -> Cells:
     own cell and the 26 around it."""
     along = np.ascontiguousarray(position.T)
     low, high = along.min(axis=1), along.max(axis=1)
-    extent = high.astype(np.float64) - low
+    # A little more, so that rounding below adds no cell.
+    extent = (high.astype(np.float64) - low) * (1 + 1e-6)
     width = max((1 + MARGIN) * radius, extent.max() / LONGEST)
     most = max(MOST, 8 * len(position))
     while np.prod(np.floor(extent / width) + 1) > most:
