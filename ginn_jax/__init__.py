@@ -67,7 +67,8 @@ Modules, in the order the data flows; each imports only what stands before it:
     lane_layers       layers of a query in a lane
     lane_fields       sums over the points around: convolutions, areas, facets
     lane_disks        Poisson disks, a sample in every lane
-    row_layers        layers of f_3D that take a point at a time
+    lane_rows         layers of f_3D that take a point at a time
+    lane_convolutions convolutions of f_3D with the layers between
     lane_encoding     f_3D in lanes, on a CPU
     lane_shading      f_2D in lanes, on a CPU
     inference         f_3D of a cloud once, f_2D at any points, sized by themselves

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 
 # Cells an axis: rounding moves a point by less than `MARGIN` of so many cells. And in
 # all: an empty cell costs a word.
@@ -11,12 +11,14 @@ LONGEST, MOST, MARGIN = 1000, 1 << 19, 1e-3
 
 
 class Cells(NamedTuple):
-    """Points sorted by cell, z fastest; rows start[c] : start[c + 1] are in cell c.
+    """Points sorted by the number of their cell, z fastest; rows start[c] :
+    start[c + 1] are in cell c.
 
     A point at `position` is in the cell floor((position - low) * rate) of each axis.
     """
 
     order: Int[np.ndarray, "N"]
+    number: Int[np.ndarray, "N"]
     start: Int[np.ndarray, "T"]
     low: Float[np.ndarray, "3"]
     rate: np.float32
@@ -42,8 +44,9 @@ def sort_into_cells(position: Float[np.ndarray, "N 3"], radius: float) -> Cells:
     bits = len(position).bit_length()
     words = np.sort((number.astype(np.int64) << bits) | np.arange(len(position)))
     order = words & ((1 << bits) - 1)
-    start = _starts((words >> bits).astype(np.int32), int(np.prod(shape)))
-    return Cells(order, start, low, rate, shape)
+    number = (words >> bits).astype(np.int32)
+    start = _starts(number, int(np.prod(shape)))
+    return Cells(order, number, start, low, rate, shape)
 
 
 def _starts(number: Int[np.ndarray, "N"], count: int) -> Int[np.ndarray, "T"]:
@@ -59,12 +62,9 @@ def _starts(number: Int[np.ndarray, "N"], count: int) -> Int[np.ndarray, "T"]:
 
 def thinned(cells: Cells, rows: Int[np.ndarray, "M"]) -> Cells:
     """The same cells with some of the sorted points only, given in ascending order."""
-    before = np.zeros(len(cells.order) + 1, np.int32)
-    before[rows + 1] = 1
-    np.cumsum(before, out=before)
-    start = aligned(1, len(cells.start)).view(np.int32)[0]
-    before.take(cells.start, out=start, mode="clip")
-    return cells._replace(order=cells.order[rows], start=start)
+    number = cells.number.take(rows)
+    start = _starts(number, len(cells.start) - 1)
+    return cells._replace(order=cells.order.take(rows), number=number, start=start)
 
 
 def aligned(rows: int, width: int) -> Float[np.ndarray, "M _"]:
@@ -72,3 +72,11 @@ def aligned(rows: int, width: int) -> Float[np.ndarray, "M _"]:
     memory = np.empty(rows * width + 16, np.float32)
     first = -memory.ctypes.data % 64 // 4
     return memory[first : first + rows * width].reshape(rows, width)
+
+
+def in_line(numbers: Shaped[np.ndarray, "N"]) -> Shaped[np.ndarray, "N"]:
+    """Copied to such memory. Dr.Jit, which compiles a program for each kind of memory
+    that it is given, is always given the same."""
+    copy = aligned(1, numbers.nbytes // 4).view(numbers.dtype)[0]
+    copy[:] = numbers
+    return copy

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt32
 
 from ginn_jax.architecture import Network
-from ginn_jax.cells import Cells, aligned, sort_into_cells, thinned
+from ginn_jax.cells import Cells, aligned, in_line, sort_into_cells, thinned
 from ginn_jax.hierarchy import DROPPED, HOLD, KEPT, WAITING, thrown_first
 from ginn_jax.lane_fields import flat
 from ginn_jax.lanes import (
@@ -21,6 +21,7 @@ from ginn_jax.lanes import (
     Table,
     program,
     runs_of,
+    side_by_side,
     table_in,
 )
 
@@ -81,7 +82,8 @@ def sample_disk_in_lanes(
 ) -> Int[np.ndarray, "K"]:
     """The rows that `hierarchy.sample_disk` keeps, in the order of their cells."""
     t, name = dr.llvm, name.astype(np.uint32)
-    lanes = flat(dr, position), flat(dr, normal), t.UInt32(lot), t.UInt32(name)
+    lanes = [t.UInt32(in_line(a)) for a in (lot, name)]
+    lanes = flat(dr, position), flat(dr, normal), *lanes
     darts = Darts(position, normal, lot, name, [*lanes])
     cells = sort_into_cells(position, disk.radius)
     if len(lot) < FEW:
@@ -94,7 +96,7 @@ def sample_disk_in_lanes(
     late = np.flatnonzero(~early)
     if len(first) and len(late):
         kept = np.full(len(first), KEPT, np.uint32)
-        target = _target(dr, cells, darts, first)
+        target = _target(dr, disk, cells, darts, first)
         asked = cells.order[late]
         late = late[_judge(dr, disk, darts, target, kept, asked, KEPT) == KEPT]
     rows = np.concatenate([first, _elect(dr, disk, cells, darts, late)])
@@ -110,7 +112,7 @@ def _elect(
     """
     if not len(rows):
         return rows
-    target, order = _target(dr, cells, darts, rows), cells.order[rows]
+    target, order = _target(dr, disk, cells, darts, rows), cells.order[rows]
     state = np.full(len(rows), WAITING, np.uint32)
     waiting, enough = np.arange(len(rows)), WAITING
     while len(waiting):
@@ -122,16 +124,18 @@ def _elect(
 
 
 def _target(
-    dr: Any, cells: Cells, darts: Darts, rows: Int[np.ndarray, "M"]
+    dr: Any, disk: Disk, cells: Cells, darts: Darts, rows: Int[np.ndarray, "M"]
 ) -> tuple[Table, Any]:
     """Some of the samples to be searched, lots as the fourth number of their place;
     and their names."""
-    some = cells.order[rows]
-    place, normal = aligned(len(rows), 4), aligned(len(rows), 4)
-    place[:, :3], normal[:, :3] = (a.take(some, 0) for a in darts[:2])
+    cells = thinned(cells, rows)
+    some = cells.order
+    place = aligned(len(rows), 4)
+    place[:, :3] = darts.position.take(some, 0)
     place.view(np.uint32)[:, 3] = darts.lot.take(some)
-    table = table_in(dr, thinned(cells, rows), place, normal)
-    return table, dr.llvm.UInt32(darts.name.take(some))
+    record = side_by_side([darts.normal], some, 4) if disk.sided else place
+    table = table_in(dr, cells, place, record)
+    return table, dr.llvm.UInt32(in_line(darts.name.take(some)))
 
 
 def _judge(
@@ -148,8 +152,8 @@ def _judge(
     A lane has seen enough once it meets one of that state.
     """
     t, (table, names) = dr.llvm, target
-    numbers = t.UInt32(state), t.UInt32(asked.astype(np.uint32))
-    given = darts.lanes, *numbers, dr.opaque(t.UInt32, enough)
+    some = state, asked.astype(np.uint32), np.array([enough], np.uint32)
+    given = darts.lanes, *(t.UInt32(in_line(a)) for a in some)
     return program(_best, disk)(list(table), names, *given).numpy()
 
 

@@ -9,42 +9,39 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Int, Key
 
-from ginn_jax.architecture import Conv, Network
+from ginn_jax.architecture import Network, reach
 from ginn_jax.facets import Around
 from ginn_jax.hierarchy import draw_lots
+from ginn_jax.lane_convolutions import (
+    Areas,
+    Numbers,
+    Points,
+    convolve,
+    feature_widths,
+)
 from ginn_jax.lane_disks import levels_in_lanes
 from ginn_jax.lane_fields import (
     Query,
-    Sum,
+    Sorted,
     areas,
     around_table,
     edge_products,
-    field_sum,
-    field_tables,
     flat,
     read_row,
     safe_inverses,
     simple_enough,
     smoothed,
-    write_row,
+    sorted_points,
 )
-from ginn_jax.lane_layers import Constants, as_constants, from_constants
 from ginn_jax.lanes import Lane, Lanes, Table, program
 from ginn_jax.neighbors import bucket
 from ginn_jax.network import Code, Variables
 from ginn_jax.receptive_field import Oriented
 from ginn_jax.renderer import use_drjit
-from ginn_jax.row_layers import Parts, enter_rows, latent_rows, rows_before
 from ginn_jax.searches import area_search, needs_areas
 from ginn_jax.shading import Encoded
-
-# Sums of a program; of more it would compile for long. Wide layers have few points.
-MOST_SUMS = 96
-
-Numbers = Float[np.ndarray, "_ _ _"] | None
-Areas = dict[int, Float[np.ndarray, "_"]]
 
 
 def encodes_in_lanes(network: Network) -> bool:
@@ -53,10 +50,8 @@ def encodes_in_lanes(network: Network) -> bool:
     """
     if any(conv.mixes for conv in network.encoder):
         return False
-    # In light's width, which is no less than that of any feature; at once.
-    widest = [2 * conv.channels + network.beams for conv in network.encoder]
-    longest = edge_products(network, max(widest, default=1), 1)
-    return simple_enough(network, longest)
+    widest = max(map(sum, feature_widths(network)))
+    return simple_enough(network, edge_products(network, widest, 1))
 
 
 def encode_in_lanes(
@@ -91,15 +86,12 @@ def encode_in_lanes(
         given = given * safe_inverses(scale)[:, None, None]
     levels = [Oriented(*(a.take(some, 0) for a in cloud)) for some in rows]
     lanes = [_ends_of(dr, level) for level in levels]
-    area = _areas(dr, network, levels, lanes)
-    normal = _padded(levels[0].normal)
-    own = normal, _padded(material), _padded(given)
-    code = _encode(dr, network, variables, levels, lanes, area, own)
-    free, beams = (
-        None if a is None else np.asarray(a)[:, : len(rows[0])] for a in code
-    )
+    area, tables = _areas(dr, network, levels, lanes)
+    points = Points(levels, lanes, area, tables)
+    weights = variables["encoder"]["params"]
+    free, beams = convolve(dr, network, weights, points, material, given)
     if scale is None:
-        free = np.asarray(free)[0]
+        free = free[0]
     ends = levels[0], None, area[0], Code(free, beams), scale
     return Encoded(*ends, around=around, kept=_named(rows, bucket(count)))
 
@@ -120,14 +112,6 @@ def _named(rows: list[Int[np.ndarray, "_"]], count: int) -> Bool[np.ndarray, "L 
 
 def _take(numbers: Numbers, rows: Int[np.ndarray, "M"]) -> Numbers:
     return None if numbers is None else numbers.take(rows, 1)
-
-
-def _padded(numbers: Float[np.ndarray, "*C N K"] | None) -> Any:
-    """Zero rows up to the next bucket."""
-    if numbers is None:
-        return None
-    missing = bucket(numbers.shape[-2]) - numbers.shape[-2]
-    return np.pad(numbers, [(0, 0)] * (numbers.ndim - 2) + [(0, missing), (0, 0)])
 
 
 def _ends_of(dr: Any, points: Oriented) -> Lanes:
@@ -171,76 +155,15 @@ def _smoothed(
 
 def _areas(
     dr: Any, network: Network, levels: list[Oriented], lanes: list[Lanes]
-) -> Areas:
-    """The area that points stand for, of each level that needs to know."""
+) -> tuple[Areas, dict[str, Sorted]]:
+    """The area that points stand for, of each level that needs to know, and the points
+    sorted for the convolutions within levels."""
     within = [c for c in network.encoder if c.source == c.target]
     within += [area_search(network)] if needs_areas(network) else []
-    found = {
-        c.source: areas(dr, levels[c.source], lanes[c.source], c.radius, network.sided)
-        for c in within
-    }
-    return {level: lane.numpy() for level, lane in found.items()}
-
-
-def _encode(
-    dr: Any,
-    network: Network,
-    variables: Variables,
-    levels: list[Oriented],
-    lanes: list[Lanes],
-    area: Areas,
-    own: tuple[Any, Any, Any],
-) -> Code:
-    """The convolutions one after the other, and the code; `own`: normal, material and
-    light of the finest points."""
-    weights = variables["encoder"]["params"]
-    parts: Parts = (enter_rows(network, *own),)
-    done: dict[str, Parts] = {}
-    for conv in network.encoder:
-        x = rows_before(network, conv, weights[conv.name], parts)
-        ends = levels[conv.source], area[conv.source], lanes[conv.target]
-        kernel = weights[conv.name]["kernel"]
-        found = _convolve(dr, network, conv, kernel, *ends, x)
-        parts = found if conv.skip is None else (*done[conv.skip], *found)
-        done[conv.name] = parts
-    return latent_rows(network, weights, parts, own[2])
-
-
-def _convolve(
-    dr: Any,
-    network: Network,
-    conv: Conv,
-    kernel: Any,
-    senders: Oriented,
-    area: Float[np.ndarray, "N"],
-    receivers: Lanes,
-    code: Code,
-) -> Parts:
-    """One convolution of every channel."""
-    t, count, rows = dr.llvm, len(senders.mask), dr.width(receivers[0])
-    parts = [np.asarray(a)[:, :count] for a in code if a is not None]
-    channels, width = len(parts[0]), sum(a.shape[2] for a in parts)
-    together = channels if channels * width <= MOST_SUMS else 1
-    groups = [
-        [a[channel] for channel in range(i, i + together) for a in parts]
-        for i in range(0, channels, together)
-    ]
-    sum_ = Sum(network.oriented, conv.radius, network.taper, width, together)
-    convolve = program(_convolved, sum_, as_constants(kernel))
-    sums = []
-    for table in field_tables(dr, sum_, senders, area, groups):
-        blank = dr.zeros(t.Float, bucket(rows) * together * width)
-        dr.make_opaque(blank)
-        found = convolve(list(table), receivers, blank).numpy()
-        sums.append(np.moveaxis(found.reshape(-1, together, width), 1, 0))
-    found, free = np.concatenate(sums), parts[0].shape[2]
-    return (Code(found[..., :free], found[..., free:] if len(parts) > 1 else None),)
-
-
-def _convolved(
-    dr: Any, sum_: Sum, kernel: Constants, table: Lanes, ends: Lanes, blank: Any
-) -> Any:
-    """The sums, row after row, written where there is nothing yet."""
-    totals, _ = field_sum(dr, sum_, from_constants(kernel), Table(*table), ends)
-    write_row(dr, blank, totals, dr.arange(dr.llvm.UInt32, dr.width(ends[0])))
-    return blank
+    found, tables = {}, {}
+    for conv in within:
+        far, level = reach(conv.radius, network.taper), conv.source
+        tables[conv.name] = sorted_points(dr, levels[level], far)
+        ends = lanes[level], conv.radius, network.sided
+        found[level] = areas(dr, tables[conv.name], *ends)
+    return found, tables

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ginn_jax.architecture import Network, reach
+from ginn_jax.cells import in_line
 from ginn_jax.errors import InputError
 from ginn_jax.facets import OWN, Around
 from ginn_jax.lane_layers import dot, perceptron
@@ -17,13 +18,16 @@ from ginn_jax.lanes import (
     Table,
     for_each_near,
     make_table,
-    make_tables,
     program,
+    read_record,
+    side_by_side,
 )
 from ginn_jax.process import LOG, on_cpu
 from ginn_jax.receptive_field import Oriented, pair_inputs
 from ginn_jax.renderer import use_drjit
 
+# Numbers that are copied to memory of one kind: of a cloud, not of an image.
+SMALL = 1 << 19
 # Multiplications that Dr.Jit still compiles in seconds.
 LONGEST = 1 << 14
 
@@ -73,12 +77,13 @@ class Query(NamedTuple):
 
 
 def flat(dr: Any, numbers: Float[np.ndarray, "..."]) -> Any:
-    """In Dr.Jit's memory, in the precision that they have."""
+    """For Dr.Jit, in the precision that they have; images where they are."""
     single = numbers.dtype == np.float32
     kind, exact = (
         (dr.llvm.Float, np.float32) if single else (dr.llvm.Float64, np.float64)
     )
-    return kind(np.ascontiguousarray(numbers, exact).reshape(-1))
+    numbers = np.ascontiguousarray(numbers, exact).reshape(-1)
+    return kind(in_line(numbers) if numbers.size < SMALL else numbers)
 
 
 def read_row(dr: Any, numbers: Any, width: int, row: Lane) -> Lanes:
@@ -86,10 +91,16 @@ def read_row(dr: Any, numbers: Any, width: int, row: Lane) -> Lanes:
     return [dr.gather(type(numbers), numbers, row * width + i) for i in range(width)]
 
 
-def write_row(dr: Any, blank: Any, row: Lanes, lane: Lane) -> None:
-    """A row from each lane, to where there is nothing yet."""
+def entries(dr: Any, numbers: Any, count: int) -> Lanes:
+    """Numbers that all lanes share."""
+    index = map(dr.llvm.UInt32, range(count))
+    return [dr.gather(type(numbers), numbers, i) for i in index]
+
+
+def write_row(dr: Any, blank: Any, row: Lanes, lane: Lane, stride: int) -> None:
+    """A row from each lane, to where there is nothing yet, `stride` numbers a row."""
     for i, number in enumerate(row):
-        place = lane * len(row) + i
+        place = lane * stride + i
         # All at once: one after the other they would be as many programs.
         dr.scatter(blank, number, place, mode=dr.ReduceMode.Permute)
 
@@ -99,7 +110,7 @@ def around_table(dr: Any, network: Network, around: Around, lit: bool) -> Table:
     points, _, light = around
     position, normal, mask = map(np.asarray, points)
     columns = [position, normal, *(np.asarray(light) if lit else [])]
-    return make_table(dr, position, mask, columns, network.smooth)
+    return make_table(dr, position, mask, columns, network.smooth)[0]
 
 
 def smoothed(dr: Any, network: Network, table: Table, query: Query) -> Query:
@@ -107,7 +118,8 @@ def smoothed(dr: Any, network: Network, table: Table, query: Query) -> Query:
     own = query.normal + [x for lanes in query.light for x in lanes]
     ends = query.place + query.normal
 
-    def visit(record: Lanes, totals: Lanes) -> Lanes:
+    def visit(row: Lane, totals: Lanes) -> Lanes:
+        record = own_record(dr, table, row)
         inputs = pair_inputs(True, ends, record[:6], network.smooth)
         near, alike = (dr.maximum(a, 0) for a in (1 - inputs[6], inputs[5]))
         weight = near * alike**2
@@ -125,48 +137,70 @@ def smoothed(dr: Any, network: Network, table: Table, query: Query) -> Query:
     return query._replace(normal=[x * length for x in mean[:3]], light=light)
 
 
-def areas(dr: Any, points: Oriented, lanes: Lanes, radius: float, sided: bool) -> Lane:
+class Sorted(NamedTuple):
+    """Points to be searched, and which of all they are."""
+
+    table: Table
+    rows: Int[np.ndarray, "M"]
+
+
+def areas(
+    dr: Any, points: Sorted, lanes: Lanes, radius: float, sided: bool
+) -> Float[np.ndarray, "N"]:
     """The area that each of the points stands for: `receptive_field.point_area`."""
-    position, normal, mask = points
-    table = make_table(dr, position, mask, [position, normal], radius)
-    return program(_area, radius, sided)(list(table), lanes)
+    return program(_area, radius, sided)(list(points.table), lanes).numpy()
 
 
 def _area(dr: Any, radius: float, sided: bool, table: Lanes, lanes: Lanes) -> Lane:
-    def visit(record: Lanes, totals: Lanes) -> Lanes:
+    searched = Table(*table)
+
+    def visit(row: Lane, totals: Lanes) -> Lanes:
+        record = own_record(dr, searched, row)
         apart = [a - b for a, b in zip(lanes[:3], record[:3], strict=True)]
         value = dr.maximum(1 - dot(apart, apart) / radius**2, 0) ** 2
         if sided:
             value = dr.select(dot(lanes[3:], record[3:6]) >= 0, value, 0)
         return [totals[0] + value]
 
-    given = Table(*table), radius, lanes[:3], visit, 1
-    (total,), _ = for_each_near(dr, *given)
+    (total,), _ = for_each_near(dr, searched, radius, lanes[:3], visit, 1)
     return np.pi * radius**2 / 3 / dr.maximum(total, 1)
 
 
+def own_record(dr: Any, table: Table, row: Lane) -> Lanes:
+    """What the table says of one of its points."""
+    return read_record(dr, table.record, dr.width(table.place) // 4, row)
+
+
 class Sum(NamedTuple):
-    """What a convolution sums: so many features, in so many channels."""
+    """What a convolution sums: so many features, in so many channels at once, of all
+    that there are."""
 
     oriented: bool
     radius: float
     taper: float
     width: int
     channels: int
+    all_channels: int
 
 
-def field_tables(
+def sorted_points(dr: Any, points: Oriented, radius: float) -> Sorted:
+    """These points with their normals, to be searched within that radius."""
+    position, normal, mask = map(np.asarray, points)
+    return Sorted(*make_table(dr, position, mask, [position, normal], radius))
+
+
+def weighed(
     dr: Any,
-    sum_: Sum,
+    found: Sorted,
     points: Oriented,
     area: Float[np.ndarray, "N"],
-    groups: Sequence[Sequence[Float[np.ndarray, "N _"]]],
-) -> list[Table]:
-    """Points with their weights and features, channel after channel, for each group."""
-    position, normal, mask = map(np.asarray, points)
-    weight = np.asarray(area)[:, None] / np.float32(np.pi * sum_.radius**2)
-    records = [[position, normal, weight, *features] for features in groups]
-    return make_tables(dr, position, mask, records, reach(sum_.radius, sum_.taper))
+    radius: float,
+) -> Table:
+    """Sorted points with what they weigh in a field of that radius."""
+    weight = np.asarray(area)[:, None] / np.float32(np.pi * radius**2)
+    columns = [*map(np.asarray, points[:2]), weight]
+    record = flat(dr, side_by_side(columns, found.rows))
+    return found.table._replace(record=record)
 
 
 def field_sum(
@@ -174,20 +208,30 @@ def field_sum(
     sum_: Sum,
     kernel: Sequence[Float[np.ndarray, "..."]],
     table: Table,
+    features: Any,
+    starts: Lane,
     ends: Lanes,
 ) -> tuple[Lanes, Lane]:
-    """Features summed around each query by `mcconv`'s rule, and how many points of the
-    table are there; `ends`: position and normal of the queries."""
-    taper = sum_.taper
+    """Features of some channels, summed around each query by `mcconv`'s rule, and how
+    many points of the table are there.
 
-    def visit(record: Lanes, totals: Lanes) -> Lanes:
-        inputs = pair_inputs(sum_.oriented, ends, record[:6], sum_.radius)
-        weight = record[6]
+    `features` are records in the table's order, channel after channel, those of the
+    channels asked for from record `starts` on; `ends`: position and normal of queries.
+    """
+    taper, points = sum_.taper, dr.width(table.place) // 4
+    starts = entries(dr, starts, sum_.channels)
+
+    def visit(row: Lane, totals: Lanes) -> Lanes:
+        own, given = own_record(dr, table, row), []
+        inputs = pair_inputs(sum_.oriented, ends, own[:6], sum_.radius)
+        weight = own[6]
         if taper:
             squared = dot(inputs[:3], inputs[:3])
             weight *= dr.clip((1 + taper - squared) / (2 * taper), 0, 1)
         values = [v * weight for v in perceptron(dr, kernel, inputs, sum_.width)]
-        given = record[7 : 7 + len(totals)]
+        for start in starts:
+            count = points * sum_.all_channels
+            given += read_record(dr, features, count, row + start)[: sum_.width]
         return [
             dr.fma(values[i % sum_.width], x, total)
             for i, (total, x) in enumerate(zip(totals, given, strict=True))

@@ -52,17 +52,15 @@ def head(
 ) -> Lane:
     """The two 1x1 layers, and what light adds to them by linear maps."""
     seen = own if network.linear else own + light
-    free = _norm(dr, network, params.get("Norm_0"), free)
-    free = _dense(dr, params["Dense_0"], free + seen)
-    free = _norm(dr, network, params.get("Norm_1"), free)
+    free = norm(dr, network, params.get("Norm_0"), free)
+    free = dense(dr, params["Dense_0"], free + seen)
+    free = norm(dr, network, params.get("Norm_1"), free)
     value = dr.llvm.Float(0)
     if not network.linear:
-        value = _dense(dr, params["Dense_1"], free)[0]
+        value = dense(dr, params["Dense_1"], free)[0]
     if beams is None:
         return value
-    gate = _dense(dr, params["out_light"]["gate"], free)
-    dimmed = _dense(dr, params["out_light"]["light"], beams + light)
-    return value + dot(gate, dimmed)
+    return value + sum(gate(dr, params["out_light"], free, beams + light))
 
 
 def perceptron(dr: Any, kernel: Any, inputs: Lanes, outputs: int) -> Lanes:
@@ -76,7 +74,7 @@ def perceptron(dr: Any, kernel: Any, inputs: Lanes, outputs: int) -> Lanes:
     return values[:outputs]
 
 
-def _norm(dr: Any, network: Network, params: Any, x: Lanes) -> Lanes:
+def norm(dr: Any, network: Network, params: Any, x: Lanes) -> Lanes:
     """`network.Norm` of one row, then leaky ReLU."""
     if network.norm == "layer":
         layer = params["LayerNorm_0"]
@@ -88,10 +86,17 @@ def _norm(dr: Any, network: Network, params: Any, x: Lanes) -> Lanes:
     return [dr.maximum(a, a * SLOPE) for a in x]
 
 
-def _dense(dr: Any, params: Any, x: Lanes) -> Lanes:
+def dense(dr: Any, params: Any, x: Lanes) -> Lanes:
+    """A 1x1 layer of one row."""
     weights = np.asarray(params["kernel"])
     bias = np.asarray(params.get("bias", np.zeros(weights.shape[1])))
     return _affine(dr, weights, bias, x)
+
+
+def gate(dr: Any, params: Any, free: Lanes, light: Lanes) -> Lanes:
+    """`network.Gate` of one row."""
+    ends = dense(dr, params["gate"], free), dense(dr, params["light"], light)
+    return [a * b for a, b in zip(*ends, strict=True)]
 
 
 def _affine(

@@ -10,22 +10,25 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ginn_jax.architecture import Network
+from ginn_jax.cells import in_line
 from ginn_jax.checks import LARGEST
 from ginn_jax.lane_fields import (
     Query,
     Sum,
     around_table,
     edge_products,
+    entries,
     field_sum,
-    field_tables,
     flat,
     read_row,
     safe_inverses,
     simple_enough,
     smoothed,
+    sorted_points,
+    weighed,
 )
 from ginn_jax.lane_layers import Constants, as_constants, dot, from_constants, head
-from ginn_jax.lanes import Lane, Lanes, Table, program
+from ginn_jax.lanes import Lane, Lanes, Table, program, side_by_side
 from ginn_jax.network import Variables
 from ginn_jax.renderer import use_drjit
 from ginn_jax.shading import Encoded
@@ -111,18 +114,25 @@ def _units(dr: Any, encoded: Encoded) -> tuple[Any, Any, Any]:
 
 def _tables(
     dr: Any, network: Network, encoded: Encoded, lit: bool
-) -> tuple[Sum, int, Lanes, Lanes | None]:
-    """What is summed, and how many features are free; the finest points with their
-    codes, and the samples around, to be searched."""
-    channels = _by_channel(encoded)
-    width = sum(a.shape[1] for a in channels[0])
-    sum_ = Sum(network.oriented, network.query.radius, 0.0, width, len(channels))
-    ends = encoded.points, np.asarray(encoded.area)
-    features = [a for parts in channels for a in parts]
-    (table,) = field_tables(dr, sum_, *ends, [features])
+) -> tuple[Sum, int, Lanes, Lanes, Lanes | None]:
+    """What is summed, and how many features are free; the finest points, their codes
+    and where those of each channel begin, and the samples around, to be searched."""
+    codes = [np.asarray(a) for a in encoded.code if a is not None]
+    width = sum(a.shape[-1] for a in codes)
+    channels = 1 if encoded.scale is None else len(encoded.scale)
+    radius, oriented = network.query.radius, network.oriented
+    sum_ = Sum(oriented, radius, 0.0, width, channels, channels)
+    found = sorted_points(dr, encoded.points, radius)
+    area = np.asarray(encoded.area)
+    table = weighed(dr, found, encoded.points, area, radius)
+    starts = np.arange(channels, dtype=np.uint32) * np.uint32(len(found.rows))
+    features = (
+        flat(dr, side_by_side(codes, found.rows)),
+        dr.llvm.UInt32(in_line(starts)),
+    )
     around = encoded.around
     near = None if around is None else list(around_table(dr, network, around, lit))
-    return sum_, channels[0][0].shape[1], list(table), near
+    return sum_, codes[0].shape[-1], list(table), list(features), near
 
 
 def _read_query(
@@ -133,7 +143,7 @@ def _read_query(
     ends, *numbers = asked
     widths = network.materials, network.lights
     place, normal = (read_row(dr, a, 3, lane) for a in ends)
-    exact = zip(map(dr.llvm.Float64, place), _entries(dr, center, 3), strict=True)
+    exact = zip(map(dr.llvm.Float64, place), entries(dr, center, 3), strict=True)
     return Query(
         [single(x - origin) for x, origin in exact],
         [single(x) for x in normal],
@@ -142,12 +152,6 @@ def _read_query(
             for arrays, width in zip(numbers, widths, strict=True)
         ),
     )
-
-
-def _entries(dr: Any, numbers: Any, count: int) -> Lanes:
-    """Numbers that all lanes share."""
-    index = map(dr.llvm.UInt32, range(count))
-    return [dr.gather(type(numbers), numbers, i) for i in index]
 
 
 def _doubtful(dr: Any, query: Query) -> Lane:
@@ -174,6 +178,7 @@ def _shade(
     asked: list[Lanes],
     units: tuple[Any, Any, Any],
     table: Lanes,
+    features: Lanes,
     around: Lanes | None,
 ) -> tuple[Lanes, Lane, Lane]:
     """The value of every channel, the number of pairs, and whether to check."""
@@ -183,8 +188,10 @@ def _shade(
     if around is not None:
         query = smoothed(dr, network, Table(*around), query)
     kernel, ends = params[network.query.name]["kernel"], query.place + query.normal
-    totals, pairs = field_sum(dr, sum_, kernel, Table(*table), ends)
-    shared = (_entries(dr, numbers, sum_.channels) for numbers in units[1:])
+    codes, starts = features
+    given = kernel, Table(*table), codes, starts, ends
+    totals, pairs = field_sum(dr, sum_, *given)
+    shared = (entries(dr, numbers, sum_.channels) for numbers in units[1:])
     values = []
     for channel, (unit, inverse) in enumerate(zip(*shared, strict=True)):
         light = [x * inverse for x in query.light[channel]] if query.light else []
@@ -194,11 +201,3 @@ def _shade(
         value = head(dr, network, params, row[:free], beams, own, light)
         values.append(value * unit)
     return values, pairs, doubtful
-
-
-def _by_channel(encoded: Encoded) -> list[list[Float[np.ndarray, "N _"]]]:
-    """Free features of the points and, if there are, light ones, of each channel."""
-    parts = [np.asarray(a) for a in encoded.code if a is not None]
-    if encoded.scale is None:
-        return [parts]
-    return [[a[i] for a in parts] for i in range(len(encoded.scale))]

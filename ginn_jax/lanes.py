@@ -7,7 +7,7 @@ near: no list, hence no capacity. Dr.Jit, which compiles the ray tracer, compile
 
 import functools
 import tracemalloc
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -78,28 +78,16 @@ def make_table(
     dr: Any,
     position: Float[np.ndarray, "N 3"],
     mask: Bool[np.ndarray, "N"],
-    columns: list[Float[np.ndarray, "N _"]],
+    columns: Sequence[Float[np.ndarray, "N _"]],
     radius: float,
-) -> Table:
-    """The points in `mask`, to be searched within that radius; a record is a row of
-    these columns side by side."""
-    return make_tables(dr, position, mask, [columns], radius)[0]
-
-
-def make_tables(
-    dr: Any,
-    position: Float[np.ndarray, "N 3"],
-    mask: Bool[np.ndarray, "N"],
-    records: list[list[Float[np.ndarray, "N _"]]],
-    radius: float,
-) -> list[Table]:
-    """`make_table` with some records or others."""
+) -> tuple[Table, Int[np.ndarray, "M"]]:
+    """The points in `mask`, to be searched within that radius, and which they are; a
+    record is a row of these columns side by side."""
     rows = np.flatnonzero(mask)
     cells = sort_into_cells(position.take(rows, 0), radius)
     rows = rows[cells.order]
-    place = _side_by_side([position], rows, 4)
-    columns = (_side_by_side(columns, rows, PACKET) for columns in records)
-    return [table_in(dr, cells, place, record) for record in columns]
+    place = side_by_side([position], rows, 4)
+    return table_in(dr, cells, place, side_by_side(columns, rows)), rows
 
 
 def table_in(
@@ -117,17 +105,27 @@ def table_in(
     return Table(flat[0], flat[1], start, t.Float(frame))
 
 
-def _side_by_side(
-    columns: list[Float[np.ndarray, "N _"]], rows: Int[np.ndarray, "M"], packet: int
-) -> Float[np.ndarray, "M _"]:
-    """Rows padded to whole packets."""
-    used = sum(column.shape[1] for column in columns)
-    table, place = aligned(len(rows), -(-used // packet) * packet), 0
-    table[:, used:] = 0
+def side_by_side(
+    columns: Sequence[Float[np.ndarray, "*C N _"]],
+    rows: Int[np.ndarray, "M"],
+    packet: int = PACKET,
+) -> Float[np.ndarray, "*C M _"]:
+    """Some rows, padded to whole packets, in `aligned` memory."""
+    used, place = sum(column.shape[-1] for column in columns), 0
+    shape = (*columns[0].shape[:-2], len(rows))
+    table = aligned(int(np.prod(shape)), in_packets(used, packet))
+    table = table.reshape(*shape, -1)
+    table[..., used:] = 0
     for column in columns:
-        table[:, place : place + column.shape[1]] = column.take(rows, 0)
-        place += column.shape[1]
+        width = column.shape[-1]
+        table[..., place : place + width] = column.take(rows, -2)
+        place += width
     return table
+
+
+def in_packets(count: int, packet: int = PACKET) -> int:
+    """So many numbers, and those that fill the last packet."""
+    return -(-count // packet) * packet
 
 
 def for_each_near(
@@ -135,11 +133,11 @@ def for_each_near(
     table: Table,
     radius: float,
     place: Lanes,
-    visit: Callable[[Lanes, Lanes], Lanes],
+    visit: Callable[[Lane, Lanes], Lanes],
     count: int,
 ) -> tuple[Lanes, Lane]:
-    """So many totals, each 0 at first, that `visit(record, totals)` renews for every
-    point nearer than `radius`, and how many those are.
+    """So many totals, each 0 at first, that `visit(row, totals)` renews for every point
+    nearer than `radius`, and how many those are; `row`: of the table.
 
     A lane notes up to `NOTED` points, then works them off, so that most lanes have
     something to do at any time, and goes on to look for others.
@@ -166,8 +164,7 @@ def for_each_near(
         return column, row, stop, noted, notes
 
     def work_off(number: Lane, notes: Any, *totals: Lane) -> tuple:
-        record = _read(dr, table, notes.read(number))
-        return number + 1, notes, *visit(record, list(totals))
+        return number + 1, notes, *visit(notes.read(number), list(totals))
 
     def round_(
         column: Lane, row: Lane, stop: Lane, found: Lane, notes: Any, *totals: Lane
@@ -218,14 +215,12 @@ def runs_of(dr: Any, table: Table, place: Lanes) -> Callable[[Lane, Lane], tuple
     return run_of
 
 
-def _read(dr: Any, table: Table, row: Lane) -> Lanes:
-    """The numbers of a record."""
-    t = dr.llvm
-    packets = dr.width(table.record) * 4 // dr.width(table.place) // PACKET
-    count = dr.width(row)
-    record: Lanes = []
+def read_record(dr: Any, records: Any, count: int, row: Lane) -> Lanes:
+    """The numbers in one of so many records."""
+    packets, lanes = dr.width(records) // count // PACKET, dr.width(row)
+    found: Lanes = []
     for packet in range(packets):
         place = row * packets + packet
-        part = dr.gather(t.ArrayXf, table.record, place, shape=(PACKET, count))
-        record += [part[i] for i in range(PACKET)]
-    return record
+        part = dr.gather(dr.llvm.ArrayXf, records, place, shape=(PACKET, lanes))
+        found += [part[i] for i in range(PACKET)]
+    return found

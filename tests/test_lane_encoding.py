@@ -9,7 +9,14 @@ import tiny
 from test_lane_shading import NETWORKS, OTHERS, case
 from test_relight import lit
 
-from ginn_jax import inference, lane_disks, lane_encoding, presets
+from ginn_jax import (
+    inference,
+    lane_convolutions,
+    lane_disks,
+    lane_encoding,
+    lane_rows,
+    presets,
+)
 from ginn_jax.lit_clouds import network_numbers
 from ginn_jax.searches import uniform_limits
 
@@ -124,10 +131,12 @@ def assert_alike_but_spread(found, expected):
         np.testing.assert_allclose(a, b, atol=1e-4 * max(np.abs(b).max(), 1))
 
 
-def test_wide_layers_sum_a_channel_at_a_time(monkeypatch):
+@pytest.mark.parametrize(("limit", "value"), [("MOST_SUMS", 1), ("MOST_WEIGHTS", 0)])
+def test_wide_layers_take_a_channel_at_a_time_or_jax(limit, value, monkeypatch):
     given = scene("beams")
     whole = encode(*given)
-    monkeypatch.setattr(lane_encoding, "MOST_SUMS", 1)
+    module = {"MOST_SUMS": lane_convolutions, "MOST_WEIGHTS": lane_rows}[limit]
+    monkeypatch.setattr(module, limit, value)
     for a, b in zip(in_order(encode(*given)), in_order(whole), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
 

@@ -30,12 +30,14 @@ def loop(points, mask, queries, radius):
     t = dr.llvm
     number = np.arange(1, len(points) + 1, dtype=np.float32)[:, None]
     columns = [points, number, number * 37 % 101]
-    table = lanes.make_table(dr, points, mask, columns, radius)
+    table, rows = lanes.make_table(dr, points, mask, columns, radius)
+    np.testing.assert_array_equal(np.sort(rows), np.flatnonzero(mask))
     lane = dr.arange(t.UInt32, len(queries))
     flat = t.Float(np.ascontiguousarray(queries).reshape(-1))
     place = [dr.gather(t.Float, flat, 3 * lane + i) for i in range(3)]
 
-    def visit(record, totals):
+    def visit(row, totals):
+        record = lanes.read_record(dr, table.record, len(rows), row)
         return [a + b for a, b in zip(totals, record[3:5], strict=True)]
 
     totals, found = lanes.for_each_near(dr, table, radius, place, visit, 2)

@@ -1,0 +1,239 @@
+"""The convolutions of f_3D in lanes, one after the other, with the layers between.
+
+What one leaves is in Dr.Jit's memory for the next, and while one runs NumPy sorts the
+points of the next into cells.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from ginn_jax.architecture import Conv, Network, reach
+from ginn_jax.cells import in_line
+from ginn_jax.lane_fields import (
+    Sorted,
+    Sum,
+    entries,
+    field_sum,
+    flat,
+    sorted_points,
+    weighed,
+    write_row,
+)
+from ginn_jax.lane_layers import Constants, as_constants, from_constants
+from ginn_jax.lane_rows import in_program, layers_by_jax, params_before, write_layers
+from ginn_jax.lanes import Lane, Lanes, Table, in_packets, program, side_by_side
+from ginn_jax.neighbors import bucket
+from ginn_jax.network import Code
+from ginn_jax.receptive_field import Oriented
+
+# Sums of a program; of more it would compile for long. Wide layers have few points.
+MOST_SUMS = 96
+
+Numbers = Float[np.ndarray, "_ _ _"] | None
+Areas = dict[int, Float[np.ndarray, "_"]]
+
+
+class Points(NamedTuple):
+    """The points of every level, position and normal of each in a lane, the area that
+    they stand for, and those sorted already, by the name of the convolution."""
+
+    levels: list[Oriented]
+    lanes: list[Lanes]
+    area: Areas
+    tables: dict[str, Sorted]
+
+
+class Width(NamedTuple):
+    """How many free features, and how many light ones."""
+
+    free: int
+    light: int
+
+
+# Features side by side as skips leave them: free and light ones of each part, a row
+# after the other, channel after channel, in Dr.Jit's memory.
+Parts = list[list[Any]]
+
+
+def convolve(
+    dr: Any,
+    network: Network,
+    weights: Any,
+    points: Points,
+    material: Numbers,
+    light: Numbers,
+) -> Code:
+    """The codes of the finest points, of every channel; `weights`: those of f_3D."""
+    weights, channels = jax.device_get(weights), 1 if light is None else len(light)
+    parts = [_enter(dr, network, points.levels[0].normal, material, light)]
+    done: dict[str, Parts] = {}
+    *widths, last = feature_widths(network)
+    for conv, width in zip(network.encoder, widths, strict=True):
+        given = dr, network, conv, width, weights, points, parts, channels
+        before = done[conv.skip] if conv.skip else []
+        parts = done[conv.name] = [*before, _convolution(*given)]
+    count = len(points.levels[0].mask)
+    own = None if light is None else flat(dr, light)
+    rows = np.arange(channels * count).reshape(channels, count)
+    codes = _layers(dr, network, None, weights, parts, own, rows, sum(last)).numpy()
+    codes = codes.reshape(channels, count, -1)
+    return Code(
+        codes[..., : last.free], codes[..., last.free :] if last.light else None
+    )
+
+
+def _convolution(
+    dr: Any,
+    network: Network,
+    conv: Conv,
+    width: Width,
+    weights: Any,
+    points: Points,
+    parts: Parts,
+    channels: int,
+) -> list[Any]:
+    """What it makes of all `parts` so far; what NumPy does is done while Dr.Jit still
+    sums what is before."""
+    senders, area = points.levels[conv.source], points.area[conv.source]
+    found = points.tables.get(conv.name)
+    if found is None:
+        found = sorted_points(dr, senders, reach(conv.radius, network.taper))
+    table = weighed(dr, found, senders, area, conv.radius)
+    rows = found.rows + len(found.rows) * np.arange(channels)[:, None]
+    stride = in_packets(sum(width))
+    features = _layers(dr, network, conv, weights, parts, None, rows, stride)
+    together = channels if channels * sum(width) <= MOST_SUMS else 1
+    shape = conv.radius, network.taper, sum(width), together, channels
+    sum_ = Sum(network.oriented, *shape)
+    kernel = as_constants(weights[conv.name]["kernel"])
+    ends = table, features, points.lanes[conv.target]
+    return _sums(dr, sum_, width, kernel, *ends)
+
+
+def feature_widths(network: Network) -> list[Width]:
+    """Of what each convolution is given and leaves, and of the codes."""
+    free = 3 + network.materials + (0 if network.linear else network.lights)
+    light = network.lights if network.linear or network.beams else 0
+    found, done = [], dict[str, Width]()
+    for conv in network.encoder:
+        if conv.before in ("dense", "lift"):
+            free, light = conv.channels, light and (network.beams or conv.channels)
+        found.append(Width(free, light))
+        skipped = done[conv.skip] if conv.skip else Width(0, 0)
+        free, light = done[conv.name] = Width(
+            free + skipped.free, light + skipped.light
+        )
+    beams = light and (network.beams or network.latent)
+    own = network.lights if network.local else 0
+    return [*found, Width(network.latent, own + beams)]
+
+
+def _enter(
+    dr: Any,
+    network: Network,
+    normal: Float[np.ndarray, "N 3"],
+    material: Numbers,
+    light: Numbers,
+) -> list[Any]:
+    """What the points show f_3D of themselves: `network.enter`."""
+    if light is None:
+        return [flat(dr, normal), None]
+    shown = [np.broadcast_to(normal, (len(light), *normal.shape)), material]
+    shown += [None if network.linear else light]
+    free = np.concatenate([a for a in shown if a is not None], axis=2)
+    linear = network.linear or network.beams
+    return [flat(dr, free), flat(dr, light) if linear else None]
+
+
+def _layers(
+    dr: Any,
+    network: Network,
+    conv: Conv | None,
+    weights: Any,
+    parts: Parts,
+    light: Any,
+    rows: Int[np.ndarray, "C M"],
+    stride: int,
+) -> Any:
+    """What a convolution is given of these rows of all channels, or the code; `light`:
+    the points' own."""
+    params, order = params_before(weights, conv), rows.reshape(-1)
+    if not in_program(params):
+        found = _rows_by_jax(network, conv, params, parts, light, rows.shape)
+        return flat(dr, side_by_side([found], order, stride))
+    place = np.empty(rows.size, np.uint32)
+    place[order] = np.arange(rows.size, dtype=np.uint32)
+    place = dr.llvm.UInt32(in_line(place))
+    run = program(write_layers, network, conv, as_constants(params), stride)
+    return run(parts, light, place, dr.empty(dr.llvm.Float, rows.size * stride))
+
+
+def _rows_by_jax(
+    network: Network,
+    conv: Conv | None,
+    params: Any,
+    parts: Parts,
+    light: Any,
+    shape: tuple[int, ...],
+) -> Float[np.ndarray, "M K"]:
+    """The same, in the order of the points."""
+    more = bucket(shape[1]) - shape[1]
+
+    def padded(numbers: Any) -> Any:
+        if numbers is None:
+            return None
+        return np.pad(numbers.numpy().reshape(*shape, -1), [(0, 0), (0, more), (0, 0)])
+
+    given = tuple(Code(*map(padded, part)) for part in parts), padded(light)
+    found = layers_by_jax(network, conv, params, *given)
+    both = [np.asarray(a)[:, : shape[1]] for a in found if a is not None]
+    return np.concatenate(both, axis=2).reshape(shape[0] * shape[1], -1)
+
+
+def _sums(
+    dr: Any,
+    sum_: Sum,
+    width: Width,
+    kernel: Constants,
+    table: Table,
+    features: Any,
+    receivers: Lanes,
+) -> list[Any]:
+    """What a convolution leaves of every channel, of which some share a program."""
+    t, rows, points = dr.llvm, dr.width(receivers[0]), dr.width(table.place) // 4
+    count = sum_.all_channels * rows
+    part = [dr.empty(t.Float, count * n) if n else None for n in width]
+    run = program(_convolved, sum_, width, kernel)
+    for some in np.arange(sum_.all_channels, dtype=np.uint32).reshape(
+        -1, sum_.channels
+    ):
+        starts = (t.UInt32(in_line(some * np.uint32(n))) for n in (points, rows))
+        part = run(list(table), features, *starts, receivers, part)
+    return part
+
+
+def _convolved(
+    dr: Any,
+    sum_: Sum,
+    width: Width,
+    kernel: Constants,
+    table: Lanes,
+    features: Any,
+    given: Lane,
+    left: Lane,
+    ends: Lanes,
+    part: list[Any],
+) -> list[Any]:
+    """The program: sums, written where there is nothing yet; `given`, `left`: where
+    the channels begin."""
+    weights, lane = from_constants(kernel), dr.arange(dr.llvm.UInt32, dr.width(ends[0]))
+    totals, _ = field_sum(dr, sum_, weights, Table(*table), features, given, ends)
+    for start in entries(dr, left, sum_.channels):
+        place = lane + start
+        for numbers, count in zip(part, width, strict=True):
+            row, totals = totals[:count], totals[count:]
+            write_row(dr, numbers, row, place, count)
+    return part

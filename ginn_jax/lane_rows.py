@@ -1,0 +1,111 @@
+"""Layers of f_3D that take a point at a time: `network`'s 1x1 layers, norms and gates.
+
+In lanes where they are small. Every weight stands in a program, which takes half a
+millisecond a weight to compile: large layers, which few points have, are JAX's.
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ginn_jax.architecture import Conv, Network
+from ginn_jax.lane_fields import read_row, write_row
+from ginn_jax.lane_layers import Constants, dense, from_constants, gate, norm
+from ginn_jax.lanes import Lane, Lanes
+from ginn_jax.network import Code, Latent, McConv, join
+
+# Weights of the layers before a convolution that are in lanes.
+MOST_WEIGHTS = 1 << 12
+
+
+def params_before(weights: Any, conv: Conv | None) -> Any:
+    """Weights of the layers before a convolution; without one, of the last layers."""
+    if conv is not None:
+        return {k: v for k, v in weights[conv.name].items() if k != "kernel"}
+    names = ("Norm_0", "Norm_1", "latent", "latent_light")
+    return {name: weights[name] for name in names if name in weights}
+
+
+def in_program(params: Any) -> bool:
+    """Whether such layers run in lanes."""
+    return sum(np.size(a) for a in jax.tree.leaves(params)) <= MOST_WEIGHTS
+
+
+def write_layers(
+    dr: Any,
+    network: Network,
+    conv: Conv | None,
+    weights: Constants,
+    stride: int,
+    parts: list[list[Any]],
+    light: Any,
+    row: Lane,
+    blank: Any,
+) -> Any:
+    """The program: what all `parts` have in a row, put through the layers, is written
+    to another, so many numbers a row; `light`: the points' own."""
+    lane = dr.arange(dr.llvm.UInt32, dr.width(row))
+
+    def read(numbers: Any) -> Lanes:
+        if numbers is None:
+            return []
+        return read_row(dr, numbers, dr.width(numbers) // dr.width(row), lane)
+
+    free, beams = ([x for part in parts for x in read(part[i])] for i in range(2))
+    given = dr, network, from_constants(weights), Code(free, beams or None)
+    found = _latent(*given, read(light)) if conv is None else _before(*given, conv)
+    write_row(dr, blank, [*found.free, *(found.light or [])], row, stride)
+    return blank
+
+
+def _before(dr: Any, network: Network, params: Any, x: Code, conv: Conv) -> Code:
+    """What `network.McConv` does before it convolves."""
+    free, beams = x
+    norms = iter([params.get("Norm_0"), params.get("Norm_1")])
+    if conv.before in ("norm", "dense"):
+        free = norm(dr, network, next(norms), free)
+    if conv.before in ("dense", "lift"):
+        free = norm(dr, network, next(norms), dense(dr, params["Dense_0"], free))
+        if beams is not None:
+            beams = gate(dr, params["Gate_0"], free, beams)
+    return Code(free, beams)
+
+
+def _latent(dr: Any, network: Network, params: Any, x: Code, light: Lanes) -> Code:
+    """What `network.latent_layers` does."""
+    free, beams = x.free, []
+    norms = iter([params.get("Norm_0"), params.get("Norm_1")])
+    if network.encoder:
+        free = norm(dr, network, next(norms), free)
+    free = norm(dr, network, next(norms), dense(dr, params["latent"], free))
+    if x.light is not None:
+        beams = gate(dr, params["latent_light"], free, x.light)
+    if network.local:
+        beams = light + beams
+    return Code(free, beams or None)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def layers_by_jax(
+    network: Network,
+    conv: Conv | None,
+    params: Any,
+    parts: tuple[Code, ...],
+    light: Float[Array, "C N L"] | None,
+) -> Code:
+    """The same of rows in every channel."""
+
+    def channel(parts: tuple[Code, ...], light: Array | None) -> Any:
+        code = join(*parts)
+        everyone = jnp.ones(code.free.shape[0], bool)
+        if conv is None:
+            layer = Latent(network, train=False)
+            return layer.apply({"params": params}, code, light, everyone)
+        layer = McConv(network, conv, train=False)
+        return layer.apply({"params": params}, code, everyone, None, 0)
+
+    return jax.vmap(channel)(parts, light)
