@@ -64,7 +64,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     block_shading     f_2D by JAX, block after block
     cells             points by cell, as loops go through them
     lanes             loops over the points near a query, a query in every lane
-    lane_layers       layers of a query in a lane
+    lane_layers       layers of a row in a lane
     lane_fields       sums over the points around: convolutions, areas, facets
     lane_disks        Poisson disks, a sample in every lane
     lane_rows         layers of f_3D that take a point at a time

@@ -75,8 +75,8 @@ def aligned(rows: int, width: int) -> Float[np.ndarray, "M _"]:
 
 
 def in_line(numbers: Shaped[np.ndarray, "N"]) -> Shaped[np.ndarray, "N"]:
-    """Copied to such memory. Dr.Jit, which compiles a program for each kind of memory
-    that it is given, is always given the same."""
+    """Numbers of 4 or 8 bytes, copied to such memory. Dr.Jit, which compiles a program
+    for each kind of memory that it is given, is always given the same."""
     copy = aligned(1, numbers.nbytes // 4).view(numbers.dtype)[0]
     copy[:] = numbers
     return copy

@@ -174,7 +174,7 @@ def network_memory(trained: Trained, cloud: Cloud) -> float:
     f_3D hands to f_2D is counted.
 
     By JAX it is what programs ask for, f_2D's on a block on every device. In lanes it
-    is the most that f_3D holds at a time (but for layers of rows, which hold less);
+    is the most that f_3D holds at a time (but for large layers of rows, JAX's);
     f_2D keeps little more than a copy of what it is handed.
     """
     network, limits, model = trained

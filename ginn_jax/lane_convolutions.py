@@ -1,7 +1,7 @@
 """The convolutions of f_3D in lanes, one after the other, with the layers between.
 
-What one leaves is in Dr.Jit's memory for the next, and while one runs NumPy sorts the
-points of the next into cells.
+What one leaves is in Dr.Jit's memory for the next. Nothing waits for a result, but for
+large layers between: while one sums, NumPy sorts the points of the next into cells.
 """
 
 from typing import Any, NamedTuple
@@ -13,23 +13,33 @@ from jaxtyping import Float, Int
 from ginn_jax.architecture import Conv, Network, reach
 from ginn_jax.cells import in_line
 from ginn_jax.lane_fields import (
-    Sorted,
     Sum,
     entries,
     field_sum,
     flat,
-    sorted_points,
+    points_in,
     weighed,
     write_row,
 )
 from ginn_jax.lane_layers import Constants, as_constants, from_constants
 from ginn_jax.lane_rows import in_program, layers_by_jax, params_before, write_layers
-from ginn_jax.lanes import Lane, Lanes, Table, in_packets, program, side_by_side
+from ginn_jax.lanes import (
+    Lane,
+    Lanes,
+    Sorted,
+    Table,
+    blank,
+    in_packets,
+    program,
+    side_by_side,
+    sort_points,
+)
 from ginn_jax.neighbors import bucket
 from ginn_jax.network import Code
 from ginn_jax.receptive_field import Oriented
 
-# Sums of a program; of more it would compile for long. Wide layers have few points.
+# Sums of a program, but for one channel that has more: it would compile for long. Wide
+# layers have few points.
 MOST_SUMS = 96
 
 Numbers = Float[np.ndarray, "_ _ _"] | None
@@ -95,12 +105,12 @@ def _convolution(
     parts: Parts,
     channels: int,
 ) -> list[Any]:
-    """What it makes of all `parts` so far; what NumPy does is done while Dr.Jit still
-    sums what is before."""
+    """What it makes of all `parts` so far."""
     senders, area = points.levels[conv.source], points.area[conv.source]
     found = points.tables.get(conv.name)
     if found is None:
-        found = sorted_points(dr, senders, reach(conv.radius, network.taper))
+        far = reach(conv.radius, network.taper)
+        found = sort_points(senders.position, senders.mask, far)
     table = weighed(dr, found, senders, area, conv.radius)
     rows = found.rows + len(found.rows) * np.arange(channels)[:, None]
     stride = in_packets(sum(width))
@@ -163,12 +173,12 @@ def _layers(
     params, order = params_before(weights, conv), rows.reshape(-1)
     if not in_program(params):
         found = _rows_by_jax(network, conv, params, parts, light, rows.shape)
-        return flat(dr, side_by_side([found], order, stride))
+        return dr.llvm.Float(side_by_side([found], order, stride).reshape(-1))
     place = np.empty(rows.size, np.uint32)
     place[order] = np.arange(rows.size, dtype=np.uint32)
     place = dr.llvm.UInt32(in_line(place))
     run = program(write_layers, network, conv, as_constants(params), stride)
-    return run(parts, light, place, dr.empty(dr.llvm.Float, rows.size * stride))
+    return run(parts, light, place, blank(dr, rows.size * stride))
 
 
 def _rows_by_jax(
@@ -202,10 +212,10 @@ def _sums(
     features: Any,
     receivers: Lanes,
 ) -> list[Any]:
-    """What a convolution leaves of every channel, of which some share a program."""
-    t, rows, points = dr.llvm, dr.width(receivers[0]), dr.width(table.place) // 4
+    """What a convolution leaves of every channel, of some at a time."""
+    t, rows, points = dr.llvm, dr.width(receivers[0]), points_in(dr, table)
     count = sum_.all_channels * rows
-    part = [dr.empty(t.Float, count * n) if n else None for n in width]
+    part = [blank(dr, count * n) if n else None for n in width]
     run = program(_convolved, sum_, width, kernel)
     for some in np.arange(sum_.all_channels, dtype=np.uint32).reshape(
         -1, sum_.channels

@@ -82,9 +82,9 @@ def sample_disk_in_lanes(
 ) -> Int[np.ndarray, "K"]:
     """The rows that `hierarchy.sample_disk` keeps, in the order of their cells."""
     t, name = dr.llvm, name.astype(np.uint32)
-    lanes = [t.UInt32(in_line(a)) for a in (lot, name)]
-    lanes = flat(dr, position), flat(dr, normal), *lanes
-    darts = Darts(position, normal, lot, name, [*lanes])
+    lanes = [flat(dr, position), flat(dr, normal)]
+    lanes += [t.UInt32(in_line(a)) for a in (lot, name)]
+    darts = Darts(position, normal, lot, name, lanes)
     cells = sort_into_cells(position, disk.radius)
     if len(lot) < FEW:
         everyone = np.arange(len(lot))
@@ -117,7 +117,6 @@ def _elect(
     waiting, enough = np.arange(len(rows)), WAITING
     while len(waiting):
         asked = order[waiting]
-        # Done once it returns: until then Dr.Jit reads the memory of the state.
         state[waiting] = _judge(dr, disk, darts, target, state, asked, enough)
         waiting, enough = waiting[state[waiting] == WAITING], KEPT
     return rows[state == KEPT]
@@ -133,6 +132,7 @@ def _target(
     place = aligned(len(rows), 4)
     place[:, :3] = darts.position.take(some, 0)
     place.view(np.uint32)[:, 3] = darts.lot.take(some)
+    # Read only where sides count.
     record = side_by_side([darts.normal], some, 4) if disk.sided else place
     table = table_in(dr, cells, place, record)
     return table, dr.llvm.UInt32(in_line(darts.name.take(some)))

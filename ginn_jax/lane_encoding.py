@@ -24,7 +24,6 @@ from ginn_jax.lane_convolutions import (
 from ginn_jax.lane_disks import levels_in_lanes
 from ginn_jax.lane_fields import (
     Query,
-    Sorted,
     areas,
     around_table,
     edge_products,
@@ -33,9 +32,8 @@ from ginn_jax.lane_fields import (
     safe_inverses,
     simple_enough,
     smoothed,
-    sorted_points,
 )
-from ginn_jax.lanes import Lane, Lanes, Table, program
+from ginn_jax.lanes import Lane, Lanes, Sorted, Table, program, sort_points
 from ginn_jax.neighbors import bucket
 from ginn_jax.network import Code, Variables
 from ginn_jax.receptive_field import Oriented
@@ -50,7 +48,8 @@ def encodes_in_lanes(network: Network) -> bool:
     """
     if any(conv.mixes for conv in network.encoder):
         return False
-    widest = max(map(sum, feature_widths(network)))
+    *widths, _ = feature_widths(network)
+    widest = max(map(sum, widths), default=1)
     return simple_enough(network, edge_products(network, widest, 1))
 
 
@@ -162,8 +161,9 @@ def _areas(
     within += [area_search(network)] if needs_areas(network) else []
     found, tables = {}, {}
     for conv in within:
-        far, level = reach(conv.radius, network.taper), conv.source
-        tables[conv.name] = sorted_points(dr, levels[level], far)
-        ends = lanes[level], conv.radius, network.sided
-        found[level] = areas(dr, tables[conv.name], *ends)
-    return found, tables
+        points, far = levels[conv.source], reach(conv.radius, network.taper)
+        tables[conv.name] = sort_points(points.position, points.mask, far)
+        ends = points, lanes[conv.source], conv.radius, network.sided
+        found[conv.source] = areas(dr, tables[conv.name], *ends)
+    # All are under way before the first is waited for.
+    return {level: lane.numpy() for level, lane in found.items()}, tables

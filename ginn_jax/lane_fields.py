@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from ginn_jax.architecture import Network, reach
 from ginn_jax.cells import in_line
@@ -15,19 +15,18 @@ from ginn_jax.lane_layers import dot, perceptron
 from ginn_jax.lanes import (
     Lane,
     Lanes,
+    Sorted,
     Table,
     for_each_near,
-    make_table,
     program,
     read_record,
-    side_by_side,
+    sort_points,
+    table_of,
 )
 from ginn_jax.process import LOG, on_cpu
 from ginn_jax.receptive_field import Oriented, pair_inputs
 from ginn_jax.renderer import use_drjit
 
-# Numbers that are copied to memory of one kind: of a cloud, not of an image.
-SMALL = 1 << 19
 # Multiplications that Dr.Jit still compiles in seconds.
 LONGEST = 1 << 14
 
@@ -77,13 +76,22 @@ class Query(NamedTuple):
 
 
 def flat(dr: Any, numbers: Float[np.ndarray, "..."]) -> Any:
-    """For Dr.Jit, in the precision that they have; images where they are."""
+    """A copy for Dr.Jit, in the precision that they have."""
+    return flat_view(dr, in_line(np.ravel(_as_known(numbers))))
+
+
+def flat_view(dr: Any, numbers: Float[np.ndarray, "..."]) -> Any:
+    """The same where they are: of whatever kind that memory is, so a program may have
+    to be traced again."""
+    numbers = _as_known(numbers)
+    kind = dr.llvm.Float if numbers.dtype == np.float32 else dr.llvm.Float64
+    return kind(np.ravel(numbers))
+
+
+def _as_known(numbers: Float[np.ndarray, "..."]) -> np.ndarray:
+    """In single or double precision."""
     single = numbers.dtype == np.float32
-    kind, exact = (
-        (dr.llvm.Float, np.float32) if single else (dr.llvm.Float64, np.float64)
-    )
-    numbers = np.ascontiguousarray(numbers, exact).reshape(-1)
-    return kind(in_line(numbers) if numbers.size < SMALL else numbers)
+    return np.ascontiguousarray(numbers, np.float32 if single else np.float64)
 
 
 def read_row(dr: Any, numbers: Any, width: int, row: Lane) -> Lanes:
@@ -97,10 +105,10 @@ def entries(dr: Any, numbers: Any, count: int) -> Lanes:
     return [dr.gather(type(numbers), numbers, i) for i in index]
 
 
-def write_row(dr: Any, blank: Any, row: Lanes, lane: Lane, stride: int) -> None:
-    """A row from each lane, to where there is nothing yet, `stride` numbers a row."""
-    for i, number in enumerate(row):
-        place = lane * stride + i
+def write_row(dr: Any, blank: Any, numbers: Lanes, to: Lane, stride: int) -> None:
+    """Numbers of each lane `to` a row where there is nothing yet, `stride` a row."""
+    for i, number in enumerate(numbers):
+        place = to * stride + i
         # All at once: one after the other they would be as many programs.
         dr.scatter(blank, number, place, mode=dr.ReduceMode.Permute)
 
@@ -110,7 +118,7 @@ def around_table(dr: Any, network: Network, around: Around, lit: bool) -> Table:
     points, _, light = around
     position, normal, mask = map(np.asarray, points)
     columns = [position, normal, *(np.asarray(light) if lit else [])]
-    return make_table(dr, position, mask, columns, network.smooth)[0]
+    return table_of(dr, sort_points(position, mask, network.smooth), columns)
 
 
 def smoothed(dr: Any, network: Network, table: Table, query: Query) -> Query:
@@ -137,18 +145,12 @@ def smoothed(dr: Any, network: Network, table: Table, query: Query) -> Query:
     return query._replace(normal=[x * length for x in mean[:3]], light=light)
 
 
-class Sorted(NamedTuple):
-    """Points to be searched, and which of all they are."""
-
-    table: Table
-    rows: Int[np.ndarray, "M"]
-
-
 def areas(
-    dr: Any, points: Sorted, lanes: Lanes, radius: float, sided: bool
-) -> Float[np.ndarray, "N"]:
+    dr: Any, found: Sorted, points: Oriented, lanes: Lanes, radius: float, sided: bool
+) -> Lane:
     """The area that each of the points stands for: `receptive_field.point_area`."""
-    return program(_area, radius, sided)(list(points.table), lanes).numpy()
+    table = table_of(dr, found, points[:2])
+    return program(_area, radius, sided)(list(table), lanes)
 
 
 def _area(dr: Any, radius: float, sided: bool, table: Lanes, lanes: Lanes) -> Lane:
@@ -168,7 +170,12 @@ def _area(dr: Any, radius: float, sided: bool, table: Lanes, lanes: Lanes) -> La
 
 def own_record(dr: Any, table: Table, row: Lane) -> Lanes:
     """What the table says of one of its points."""
-    return read_record(dr, table.record, dr.width(table.place) // 4, row)
+    return read_record(dr, table.record, points_in(dr, table), row)
+
+
+def points_in(dr: Any, table: Table) -> int:
+    """How many points there are."""
+    return dr.width(table.place) // 4
 
 
 class Sum(NamedTuple):
@@ -183,12 +190,6 @@ class Sum(NamedTuple):
     all_channels: int
 
 
-def sorted_points(dr: Any, points: Oriented, radius: float) -> Sorted:
-    """These points with their normals, to be searched within that radius."""
-    position, normal, mask = map(np.asarray, points)
-    return Sorted(*make_table(dr, position, mask, [position, normal], radius))
-
-
 def weighed(
     dr: Any,
     found: Sorted,
@@ -197,10 +198,8 @@ def weighed(
     radius: float,
 ) -> Table:
     """Sorted points with what they weigh in a field of that radius."""
-    weight = np.asarray(area)[:, None] / np.float32(np.pi * radius**2)
-    columns = [*map(np.asarray, points[:2]), weight]
-    record = flat(dr, side_by_side(columns, found.rows))
-    return found.table._replace(record=record)
+    weight = area[:, None] / np.float32(np.pi * radius**2)
+    return table_of(dr, found, [*points[:2], weight])
 
 
 def field_sum(
@@ -218,7 +217,7 @@ def field_sum(
     `features` are records in the table's order, channel after channel, those of the
     channels asked for from record `starts` on; `ends`: position and normal of queries.
     """
-    taper, points = sum_.taper, dr.width(table.place) // 4
+    taper, points = sum_.taper, points_in(dr, table)
     starts = entries(dr, starts, sum_.channels)
 
     def visit(row: Lane, totals: Lanes) -> Lanes:

@@ -43,22 +43,23 @@ def write_layers(
     stride: int,
     parts: list[list[Any]],
     light: Any,
-    row: Lane,
+    to: Lane,
     blank: Any,
 ) -> Any:
     """The program: what all `parts` have in a row, put through the layers, is written
     to another, so many numbers a row; `light`: the points' own."""
-    lane = dr.arange(dr.llvm.UInt32, dr.width(row))
+    rows = dr.width(to)
+    lane = dr.arange(dr.llvm.UInt32, rows)
 
     def read(numbers: Any) -> Lanes:
         if numbers is None:
             return []
-        return read_row(dr, numbers, dr.width(numbers) // dr.width(row), lane)
+        return read_row(dr, numbers, dr.width(numbers) // rows, lane)
 
     free, beams = ([x for part in parts for x in read(part[i])] for i in range(2))
     given = dr, network, from_constants(weights), Code(free, beams or None)
     found = _latent(*given, read(light)) if conv is None else _before(*given, conv)
-    write_row(dr, blank, [*found.free, *(found.light or [])], row, stride)
+    write_row(dr, blank, [*found.free, *(found.light or [])], to, stride)
     return blank
 
 

@@ -20,16 +20,17 @@ from ginn_jax.lane_fields import (
     entries,
     field_sum,
     flat,
+    flat_view,
     read_row,
     safe_inverses,
     simple_enough,
     smoothed,
-    sorted_points,
     weighed,
 )
 from ginn_jax.lane_layers import Constants, as_constants, dot, from_constants, head
-from ginn_jax.lanes import Lane, Lanes, Table, program, side_by_side
+from ginn_jax.lanes import Lane, Lanes, Table, program, side_by_side, sort_points
 from ginn_jax.network import Variables
+from ginn_jax.receptive_field import Oriented
 from ginn_jax.renderer import use_drjit
 from ginn_jax.shading import Encoded
 
@@ -82,7 +83,7 @@ def shade_in_lanes(
         return Shaded(np.zeros((0, *shape), np.float32), 0, False)
     numbers = ([] if a is None else [*np.asarray(a)] for a in (material, light))
     own = [[np.asarray(position), np.asarray(normal)], *numbers]
-    asked = [[flat(dr, a) for a in arrays] for arrays in own]
+    asked = [[flat_view(dr, a) for a in arrays] for arrays in own]
     sum_, free, *tables = _tables(dr, network, encoded, light is not None)
     weights = as_constants(variables["shader"]["params"])
     run = program(_shade, network, sum_, free, weights)
@@ -96,7 +97,7 @@ def shade_in_lanes(
 def _lanes_of(dr: Any, count: int, rows: Int[np.ndarray, "M"] | None) -> Lane:
     """The row of each lane."""
     if rows is not None:
-        return dr.llvm.UInt32(rows.astype(np.uint32))
+        return dr.llvm.UInt32(in_line(rows.astype(np.uint32)))
     lane = dr.arange(dr.llvm.UInt32, count)
     dr.make_opaque(lane)
     return lane
@@ -104,12 +105,11 @@ def _lanes_of(dr: Any, count: int, rows: Int[np.ndarray, "M"] | None) -> Lane:
 
 def _units(dr: Any, encoded: Encoded) -> tuple[Any, Any, Any]:
     """The centre, the units of light, and what light is multiplied by."""
-    t = dr.llvm
     center = np.zeros(3) if encoded.center is None else np.asarray(encoded.center)
     scale = np.ones(1) if encoded.scale is None else np.asarray(encoded.scale)
     scale = scale.astype(np.float32)
-    center = t.Float64(center.astype(np.float64))
-    return center, t.Float(scale), t.Float(safe_inverses(scale))
+    center = flat(dr, center.astype(np.float64))
+    return center, flat(dr, scale), flat(dr, safe_inverses(scale))
 
 
 def _tables(
@@ -122,9 +122,9 @@ def _tables(
     channels = 1 if encoded.scale is None else len(encoded.scale)
     radius, oriented = network.query.radius, network.oriented
     sum_ = Sum(oriented, radius, 0.0, width, channels, channels)
-    found = sorted_points(dr, encoded.points, radius)
-    area = np.asarray(encoded.area)
-    table = weighed(dr, found, encoded.points, area, radius)
+    points = Oriented(*map(np.asarray, encoded.points))
+    found = sort_points(points.position, points.mask, radius)
+    table = weighed(dr, found, points, np.asarray(encoded.area), radius)
     starts = np.arange(channels, dtype=np.uint32) * np.uint32(len(found.rows))
     features = (
         flat(dr, side_by_side(codes, found.rows)),

@@ -23,7 +23,7 @@ NOTED, PACKET = 32, 8
 COLUMNS = 9
 
 # Programs that are kept, with weights of their own: those of a dozen networks.
-PROGRAMS, NEVER = 256, 1 << 30
+PROGRAMS, NEVER = 512, 1 << 30
 
 # A number, or a few, in each lane.
 Lane = Any
@@ -74,20 +74,29 @@ class Table(NamedTuple):
     frame: Any
 
 
-def make_table(
-    dr: Any,
-    position: Float[np.ndarray, "N 3"],
-    mask: Bool[np.ndarray, "N"],
-    columns: Sequence[Float[np.ndarray, "N _"]],
-    radius: float,
-) -> tuple[Table, Int[np.ndarray, "M"]]:
-    """The points in `mask`, to be searched within that radius, and which they are; a
-    record is a row of these columns side by side."""
+class Sorted(NamedTuple):
+    """Points sorted into cells: where each is, and which of all it is."""
+
+    cells: Cells
+    place: Float[np.ndarray, "M 4"]
+    rows: Int[np.ndarray, "M"]
+
+
+def sort_points(
+    position: Float[np.ndarray, "N 3"], mask: Bool[np.ndarray, "N"], radius: float
+) -> Sorted:
+    """The points in `mask`, to be searched within that radius."""
     rows = np.flatnonzero(mask)
     cells = sort_into_cells(position.take(rows, 0), radius)
     rows = rows[cells.order]
-    place = side_by_side([position], rows, 4)
-    return table_in(dr, cells, place, side_by_side(columns, rows)), rows
+    return Sorted(cells, side_by_side([position], rows, 4), rows)
+
+
+def table_of(
+    dr: Any, found: Sorted, columns: Sequence[Float[np.ndarray, "N _"]]
+) -> Table:
+    """Those points; a record is a row of these columns side by side."""
+    return table_in(dr, *found[:2], side_by_side(columns, found.rows))
 
 
 def table_in(
@@ -98,11 +107,11 @@ def table_in(
 ) -> Table:
     """The points of these cells in their order, from `aligned` memory."""
     t = dr.llvm
-    frame = aligned(1, 8)[0]
-    frame[:] = *cells.low, cells.rate, *cells.shape, 0
+    frame = aligned(1, 8)
+    frame[0] = *cells.low, cells.rate, *cells.shape, 0
     start = t.UInt32(cells.start.view(np.uint32))
-    flat = t.Float(place.reshape(-1)), t.Float(record.reshape(-1))
-    return Table(flat[0], flat[1], start, t.Float(frame))
+    place, record, frame = (t.Float(np.ravel(a)) for a in (place, record, frame))
+    return Table(place, record, start, frame)
 
 
 def side_by_side(
@@ -121,6 +130,12 @@ def side_by_side(
         table[..., place : place + width] = column.take(rows, -2)
         place += width
     return table
+
+
+def blank(dr: Any, count: int) -> Any:
+    """Memory for so many numbers, with anything in it. Not Dr.Jit's own: its size would
+    be part of a program."""
+    return dr.llvm.Float(aligned(1, count)[0])
 
 
 def in_packets(count: int, packet: int = PACKET) -> int:

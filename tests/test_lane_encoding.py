@@ -14,8 +14,11 @@ from ginn_jax import (
     lane_convolutions,
     lane_disks,
     lane_encoding,
+    lane_fields,
     lane_rows,
+    lanes,
     presets,
+    train,
 )
 from ginn_jax.lit_clouds import network_numbers
 from ginn_jax.searches import uniform_limits
@@ -138,6 +141,71 @@ def test_wide_layers_take_a_channel_at_a_time_or_jax(limit, value, monkeypatch):
     module = {"MOST_SUMS": lane_convolutions, "MOST_WEIGHTS": lane_rows}[limit]
     monkeypatch.setattr(module, limit, value)
     assert_alike(given[0], encode(*given), whole)
+
+
+def shapes(presets_of):
+    """Networks that run in lanes, with what each layer of f_3D is."""
+    for network in presets_of.values():
+        if lane_encoding.encodes_in_lanes(network):
+            config = replace(tiny.CONFIG, network=network)
+            state = train.state_shapes(config)
+            yield network, state.variables["encoder"]["params"]
+
+
+@pytest.mark.parametrize(
+    "presets_of", [presets.PRESETS, presets.ILLUMINATION, presets.SCATTERING]
+)
+def test_widths_are_those_of_the_layers(presets_of):
+    for network, params in shapes(presets_of):
+        *widths, last = lane_convolutions.feature_widths(network)
+        for conv, width in zip(network.encoder, widths, strict=True):
+            *_, bias = params[conv.name]["kernel"]
+            assert bias.shape[0] * bias.shape[1] >= sum(width)
+            group = network.group or sum(width)
+            assert bias.shape == (-(-sum(width) // group), min(group, sum(width)))
+            if conv.before in ("dense", "lift"):
+                assert params[conv.name]["Dense_0"]["kernel"].shape[1] == width.free
+            if width.light:
+                gate = params[conv.name]["Gate_0"]["light"]["kernel"]
+                assert gate.shape[1] == width.light
+        assert params["latent"]["kernel"].shape[1] == last.free
+        own = network.lights if network.local else 0
+        gate = params.get("latent_light")
+        assert last.light - own == (gate["light"]["kernel"].shape[1] if gate else 0)
+
+
+def shifted(numbers):
+    """The same numbers elsewhere in memory, four bytes off."""
+    memory = np.empty(numbers.size + 1, numbers.dtype)
+    memory[1:] = numbers.reshape(-1)
+    return memory[1:].reshape(numbers.shape)
+
+
+def test_nothing_is_traced_twice(monkeypatch):
+    """Whatever memory the caller's arrays lie in, and however many points they are; but
+    for disks, whose rounds may ask as many samples as they have or have not."""
+    made, given = [], scene("smooth")
+
+    def kept(function, *static):
+        made.append(program(function, *static))
+        return made[-1]
+
+    program = lanes.program
+    for module in (lane_convolutions, lane_encoding, lane_fields):
+        monkeypatch.setattr(module, "program", kept)
+    network, variables, cloud, numbers = given
+    encode(*given)
+    before = [run.n_recordings for run in made]
+    assert len(before) == 5
+    for count in (1500, 1400, 1300):
+        part = cloud._replace(
+            position=shifted(cloud.position[:count]),
+            normal=shifted(cloud.normal[:count]),
+        )
+        less = [a if a is None else shifted(a[:, :count]) for a in numbers]
+        made.clear()
+        encode(network, variables, part, less)
+        assert [run.n_recordings for run in made] == before
 
 
 def test_weights_that_change_are_not_mixed_up():

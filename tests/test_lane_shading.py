@@ -26,11 +26,17 @@ from ginn_jax.searches import uniform_limits
 pytestmark = pytest.mark.usefixtures("cheap_compiling")
 
 KEY = jax.random.key(2)
+FEW_LAYERS = tuple(
+    replace(conv, before=before)
+    for conv, before in zip(
+        tiny.NETWORK.encoder, ("raw", "norm", "dense", "norm"), strict=True
+    )
+)
 NETWORKS = {name: n for name, n in EFFECTS.items() if not n.splat} | {
-    "occlusion": tiny.NETWORK,
+    "occlusion": replace(tiny.NETWORK, taper=0.4, sided=True),
     "offsets": replace(tiny.ONE_LEVEL, oriented=False, norm="none"),
-    "kernels in blocks": replace(tiny.NETWORK, group=3),
-    "smooth": replace(EFFECTS["beams"], smooth=0.1),
+    "kernels in blocks": replace(tiny.NETWORK, group=3, encoder=FEW_LAYERS),
+    "smooth": replace(EFFECTS["beams"], smooth=0.1, taper=0.4, sided=True),
 }
 OTHERS = {
     "splat": EFFECTS["only_3d"],

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 from strategies import FACES, FAR, RADII, UNIT, clouds, coordinates
 
 from ginn_jax import cells, lanes
@@ -30,7 +31,8 @@ def loop(points, mask, queries, radius):
     t = dr.llvm
     number = np.arange(1, len(points) + 1, dtype=np.float32)[:, None]
     columns = [points, number, number * 37 % 101]
-    table, rows = lanes.make_table(dr, points, mask, columns, radius)
+    found = lanes.sort_points(points, mask, radius)
+    rows, table = found.rows, lanes.table_of(dr, found, columns)
     np.testing.assert_array_equal(np.sort(rows), np.flatnonzero(mask))
     lane = dr.arange(t.UInt32, len(queries))
     flat = t.Float(np.ascontiguousarray(queries).reshape(-1))
@@ -100,9 +102,40 @@ def test_cells_hold_all_points_and_are_wide_enough(points, radius, most):
     assert 1 / found.rate >= radius
     np.testing.assert_array_equal(np.sort(found.order), np.arange(len(points)))
     assert found.start[0] == 0
+    assert (np.diff(found.number) >= 0).all()
     assert found.start[-1] == len(points)
     place = np.floor((points - found.low) * found.rate).astype(int)
     number = np.ravel_multi_index(tuple(place.T), found.shape)
     for cell in np.unique(number):
         rows = found.order[found.start[cell] : found.start[cell + 1]]
         np.testing.assert_array_equal(rows, np.flatnonzero(number == cell))
+
+
+@given(clouds().filter(len), st.data())
+def test_thinned_cells_are_those_of_fewer_points(points, data):
+    found = cells.sort_into_cells(points, 0.25)
+    kept = data.draw(hnp.arrays(bool, len(points)))
+    thin = cells.thinned(found, np.flatnonzero(kept))
+    np.testing.assert_array_equal(thin.order, found.order[kept])
+    counts = np.bincount(found.number[kept], minlength=len(found.start) - 1)
+    np.testing.assert_array_equal(np.diff(thin.start), counts)
+    assert thin.start[0] == 0
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.uint32])
+def test_copies_begin_on_a_cache_line(kind):
+    for count in (1, 7, 100):
+        numbers = np.arange(count + 1).astype(kind)[1:]
+        copy = cells.in_line(numbers)
+        assert copy.ctypes.data % 64 == 0
+        assert copy.dtype == kind
+        np.testing.assert_array_equal(copy, numbers)
+
+
+def test_rows_stand_side_by_side_in_every_channel():
+    a, b = np.arange(24.0).reshape(2, 4, 3), np.arange(8.0).reshape(2, 4, 1)
+    found = lanes.side_by_side([a, b], np.array([3, 1]))
+    assert found.shape == (2, 2, 8)
+    np.testing.assert_array_equal(found[..., :3], a[:, [3, 1]])
+    np.testing.assert_array_equal(found[..., 3:4], b[:, [3, 1]])
+    assert (found[..., 4:] == 0).all()
