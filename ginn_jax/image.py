@@ -140,7 +140,10 @@ def shade_image(
     if step == 1:
         return shade(surface, numbers)
     thickness = np.float32(0.2 * network.query.radius)
-    near = surface._replace(position=counted_from(encoded.center, surface.position))
+    near = surface
+    if surface.position.dtype != np.float32:
+        # Only differences count: in single precision no other origin betters them.
+        near = surface._replace(position=counted_from(encoded.center, surface.position))
     taken = _blend_between(step, near, thickness)
     places = tuple(sampled(n, step) for n in surface.mask.shape)
     between = np.array(taken.known)
