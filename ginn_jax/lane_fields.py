@@ -217,7 +217,7 @@ def field_sum(
     `features` are records in the table's order, channel after channel, those of the
     channels asked for from record `starts` on; `ends`: position and normal of queries.
     """
-    taper, points = sum_.taper, points_in(dr, table)
+    taper, records = sum_.taper, points_in(dr, table) * sum_.all_channels
     starts = entries(dr, starts, sum_.channels)
 
     def visit(row: Lane, totals: Lanes) -> Lanes:
@@ -229,8 +229,7 @@ def field_sum(
             weight *= dr.clip((1 + taper - squared) / (2 * taper), 0, 1)
         values = [v * weight for v in perceptron(dr, kernel, inputs, sum_.width)]
         for start in starts:
-            count = points * sum_.all_channels
-            given += read_record(dr, features, count, row + start)[: sum_.width]
+            given += read_record(dr, features, records, row + start)[: sum_.width]
         return [
             dr.fma(values[i % sum_.width], x, total)
             for i, (total, x) in enumerate(zip(totals, given, strict=True))

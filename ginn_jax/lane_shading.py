@@ -126,10 +126,8 @@ def _tables(
     found = sort_points(points.position, points.mask, radius)
     table = weighed(dr, found, points, np.asarray(encoded.area), radius)
     starts = np.arange(channels, dtype=np.uint32) * np.uint32(len(found.rows))
-    features = (
-        flat(dr, side_by_side(codes, found.rows)),
-        dr.llvm.UInt32(in_line(starts)),
-    )
+    records = dr.llvm.Float(side_by_side(codes, found.rows).reshape(-1))
+    features = records, dr.llvm.UInt32(in_line(starts))
     around = encoded.around
     near = None if around is None else list(around_table(dr, network, around, lit))
     return sum_, codes[0].shape[-1], list(table), list(features), near
