@@ -74,6 +74,15 @@ def aligned(rows: int, width: int) -> Float[np.ndarray, "M _"]:
     return memory[first : first + rows * width].reshape(rows, width)
 
 
+def rows_of(
+    numbers: Float[np.ndarray, "N K"], rows: Int[np.ndarray, "M"]
+) -> Float[np.ndarray, "M K"]:
+    """Some rows of numbers in single precision, in such memory."""
+    memory = aligned(len(rows), numbers.shape[1])
+    # With "raise", NumPy would write them elsewhere first.
+    return np.take(numbers, rows, 0, memory, "clip")
+
+
 def in_line(numbers: Shaped[np.ndarray, "N"]) -> Shaped[np.ndarray, "N"]:
     """Numbers of 4 or 8 bytes, copied to such memory. Dr.Jit, which compiles a program
     for each kind of memory that it is given, is always given the same."""

@@ -11,9 +11,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt32
 
 from ginn_jax.architecture import Network
-from ginn_jax.cells import Cells, aligned, in_line, sort_into_cells, thinned
+from ginn_jax.cells import (
+    Cells,
+    aligned,
+    in_line,
+    rows_of,
+    sort_into_cells,
+    thinned,
+)
 from ginn_jax.hierarchy import DROPPED, HOLD, KEPT, WAITING, thrown_first
-from ginn_jax.lane_fields import flat
 from ginn_jax.lanes import (
     COLUMNS,
     Lane,
@@ -21,7 +27,6 @@ from ginn_jax.lanes import (
     Table,
     program,
     runs_of,
-    side_by_side,
     table_in,
 )
 
@@ -41,13 +46,12 @@ class Disk(NamedTuple):
 
 
 class Darts(NamedTuple):
-    """Samples to be thrown, smaller lots first, ties by name; and the same numbers in
+    """Samples to be thrown, sorted by cell: where each is and its lot, which way it
+    faces and its name. Smaller lots come first, ties by name. And the same numbers in
     Dr.Jit's memory."""
 
-    position: Float[np.ndarray, "N 3"]
-    normal: Float[np.ndarray, "N 3"]
-    lot: UInt32[np.ndarray, "N"]
-    name: UInt32[np.ndarray, "N"]
+    place: Float[np.ndarray, "N 4"]
+    facing: Float[np.ndarray, "N 4"]
     lanes: Lanes
 
 
@@ -81,26 +85,40 @@ def sample_disk_in_lanes(
     name: Int[np.ndarray, "N"],
 ) -> Int[np.ndarray, "K"]:
     """The rows that `hierarchy.sample_disk` keeps, in the order of their cells."""
-    t, name = dr.llvm, name.astype(np.uint32)
-    lanes = [flat(dr, position), flat(dr, normal)]
-    lanes += [t.UInt32(in_line(a)) for a in (lot, name)]
-    darts = Darts(position, normal, lot, name, lanes)
     cells = sort_into_cells(position, disk.radius)
+    darts = _darts(dr, cells, position, normal, lot, name)
+    lot = lot.take(cells.order)
     if len(lot) < FEW:
-        everyone = np.arange(len(lot))
-        return cells.order[_elect(dr, disk, cells, darts, everyone)]
-    early = lot.take(cells.order) < (HALF if disk.moved else QUARTER)
+        return cells.order[_elect(dr, disk, cells, darts, np.arange(len(lot)))]
+    early = lot < (HALF if disk.moved else QUARTER)
     if not early.any():  # none was kept before
-        early = lot.take(cells.order) < HALF + QUARTER // 2
+        early = lot < HALF + QUARTER // 2
     first = _elect(dr, disk, cells, darts, np.flatnonzero(early))
     late = np.flatnonzero(~early)
     if len(first) and len(late):
         kept = np.full(len(first), KEPT, np.uint32)
-        target = _target(dr, disk, cells, darts, first)
-        asked = cells.order[late]
-        late = late[_judge(dr, disk, darts, target, kept, asked, KEPT) == KEPT]
+        target = _target(dr, cells, darts, first)
+        late = late[_judge(dr, disk, darts, target, kept, late, KEPT) == KEPT]
     rows = np.concatenate([first, _elect(dr, disk, cells, darts, late)])
     return cells.order[np.sort(rows)]
+
+
+def _darts(
+    dr: Any,
+    cells: Cells,
+    position: Float[np.ndarray, "N 3"],
+    normal: Float[np.ndarray, "N 3"],
+    lot: UInt32[np.ndarray, "N"],
+    name: Int[np.ndarray, "N"],
+) -> Darts:
+    """The samples in the order of their cells."""
+    found = []
+    for numbers, last in ((position, lot), (normal, name)):
+        row = aligned(len(lot), 4)
+        row[:, :3] = numbers.take(cells.order, 0)
+        row.view(np.uint32)[:, 3] = last.take(cells.order)
+        found.append(row)
+    return Darts(*found, [dr.llvm.Float(np.ravel(a)) for a in found])
 
 
 def _elect(
@@ -112,37 +130,27 @@ def _elect(
     """
     if not len(rows):
         return rows
-    target, order = _target(dr, disk, cells, darts, rows), cells.order[rows]
+    target = _target(dr, cells, darts, rows)
     state = np.full(len(rows), WAITING, np.uint32)
     waiting, enough = np.arange(len(rows)), WAITING
     while len(waiting):
-        asked = order[waiting]
+        asked = rows[waiting]
         state[waiting] = _judge(dr, disk, darts, target, state, asked, enough)
         waiting, enough = waiting[state[waiting] == WAITING], KEPT
     return rows[state == KEPT]
 
 
-def _target(
-    dr: Any, disk: Disk, cells: Cells, darts: Darts, rows: Int[np.ndarray, "M"]
-) -> tuple[Table, Any]:
-    """Some of the samples to be searched, lots as the fourth number of their place;
-    and their names."""
-    cells = thinned(cells, rows)
-    some = cells.order
-    place = aligned(len(rows), 4)
-    place[:, :3] = darts.position.take(some, 0)
-    place.view(np.uint32)[:, 3] = darts.lot.take(some)
-    # Read only where sides count.
-    record = side_by_side([darts.normal], some, 4) if disk.sided else place
-    table = table_in(dr, cells, place, record)
-    return table, dr.llvm.UInt32(in_line(darts.name.take(some)))
+def _target(dr: Any, cells: Cells, darts: Darts, rows: Int[np.ndarray, "M"]) -> Table:
+    """Some of the samples, to be searched."""
+    some = (rows_of(a, rows) for a in (darts.place, darts.facing))
+    return table_in(dr, thinned(cells, rows), *some)
 
 
 def _judge(
     dr: Any,
     disk: Disk,
     darts: Darts,
-    target: tuple[Table, Any],
+    target: Table,
     state: UInt32[np.ndarray, "M"],
     asked: Int[np.ndarray, "Q"],
     enough: int,
@@ -151,17 +159,15 @@ def _judge(
 
     A lane has seen enough once it meets one of that state.
     """
-    t, (table, names) = dr.llvm, target
     some = state, asked.astype(np.uint32), np.array([enough], np.uint32)
-    given = darts.lanes, *(t.UInt32(in_line(a)) for a in some)
-    return program(_best, disk)(list(table), names, *given).numpy()
+    given = darts.lanes, *(dr.llvm.UInt32(in_line(a)) for a in some)
+    return program(_best, disk)(list(target), *given).numpy()
 
 
 def _best(
     dr: Any,
     disk: Disk,
     table: Lanes,
-    names: Lane,
     darts: Lanes,
     state: Lane,
     asked: Lane,
@@ -169,21 +175,19 @@ def _best(
 ) -> Lane:
     """What `_judge` says, by the highest state among betters in conflict."""
     t, searched = dr.llvm, Table(*table)
-    place, normal = (
-        [dr.gather(t.Float, a, asked * 3 + i) for i in range(3)] for a in darts[:2]
-    )
-    lot, name = (dr.gather(t.UInt32, a, asked) for a in darts[2:])
+    (*place, lot), (*normal, name) = (dr.gather(t.Array4f, a, asked) for a in darts)
+    lot, name = (dr.reinterpret_array(t.UInt32, a) for a in (lot, name))
     run_of = runs_of(dr, searched, place)
 
     def test(row: Lane, stop: Lane, best: Lane) -> tuple:
         found = dr.gather(t.Array4f, searched.place, row)
         other = dr.reinterpret_array(t.UInt32, found[3])
         squared = sum((x - found[i]) ** 2 for i, x in enumerate(place))
-        tie = other == lot
-        better = (other < lot) | (tie & (dr.gather(t.UInt32, names, row, tie) < name))
-        conflict = better & _conflict(disk, squared, other, lot)
+        conflict = (other <= lot) & _conflict(disk, squared, other, lot)
+        facing = dr.gather(t.Array4f, searched.record, row, conflict)
+        tied = dr.reinterpret_array(t.UInt32, facing[3]) < name
+        conflict &= (other < lot) | tied
         if disk.sided:
-            facing = dr.gather(t.Array4f, searched.record, row, conflict)
             conflict &= sum(normal[i] * facing[i] for i in range(3)) >= 0
         seen = dr.gather(t.UInt32, state, row, conflict)
         return row + 1, stop, dr.maximum(best, seen)

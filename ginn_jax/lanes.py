@@ -164,7 +164,8 @@ def for_each_near(
         def test(row: Lane, noted: Lane, notes: Any) -> tuple:
             found = dr.gather(t.Array4f, table.place, row)
             near = sum((x - found[i]) ** 2 for i, x in enumerate(place)) < radius**2
-            notes.write(row, noted, near)
+            # Others are overwritten: to store some lanes only is a jump for each.
+            notes.write(row, noted)
             return row + 1, dr.select(near, noted + 1, noted), notes
 
         row, noted, notes = dr.while_loop(
