@@ -52,7 +52,9 @@ def sort_into_cells(position: Float[np.ndarray, "N 3"], radius: float) -> Cells:
 def _starts(number: Int[np.ndarray, "N"], count: int) -> Int[np.ndarray, "T"]:
     """Of so many cells and the end, the first of these sorted points that is not before
     it. Most cells are empty: runs of them are written, points are not counted."""
-    first = np.flatnonzero(np.diff(number, prepend=-1)).astype(np.int32)
+    starts = np.ones(len(number), bool)
+    np.not_equal(number[1:], number[:-1], out=starts[1:])
+    first = np.flatnonzero(starts).astype(np.int32)
     ends = np.append(first, np.int32(len(number)))
     cells = np.concatenate([[-1], number[first], [count]])
     start = aligned(1, count + 1).view(np.int32)[0]

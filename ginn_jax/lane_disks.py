@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float, Int, UInt32
 from ginn_jax.architecture import Network
 from ginn_jax.cells import (
     Cells,
-    aligned,
     in_line,
     rows_of,
     sort_into_cells,
@@ -27,6 +26,7 @@ from ginn_jax.lanes import (
     Table,
     program,
     runs_of,
+    side_by_side,
     table_in,
 )
 
@@ -112,12 +112,10 @@ def _darts(
     name: Int[np.ndarray, "N"],
 ) -> Darts:
     """The samples in the order of their cells."""
-    found = []
-    for numbers, last in ((position, lot), (normal, name)):
-        row = aligned(len(lot), 4)
-        row[:, :3] = numbers.take(cells.order, 0)
-        row.view(np.uint32)[:, 3] = last.take(cells.order)
-        found.append(row)
+    found = [
+        side_by_side([row, last.view(np.float32)[:, None]], cells.order, 4)
+        for row, last in ((position, lot), (normal, name.astype(np.uint32)))
+    ]
     return Darts(*found, [dr.llvm.Float(np.ravel(a)) for a in found])
 
 
