@@ -63,7 +63,8 @@ Modules, in the order the data flows; each imports only what stands before it:
     blocks            points padded, queries in blocks for all devices
     block_shading     f_2D by JAX, block after block
     cells             points by cell, as loops go through them
-    lanes             loops over the points near a query, a query in every lane
+    lanes             points and programs in Dr.Jit's memory, a query in every lane
+    lane_loops        loops over the points near a query
     lane_layers       layers of a row in a lane
     lane_fields       sums over the points around: convolutions, areas, facets
     lane_disks        Poisson disks, a sample in every lane

@@ -4,6 +4,7 @@ What one leaves is in Dr.Jit's memory for the next. Nothing waits for a result, 
 large layers between: while one sums, NumPy sorts the points of the next into cells.
 """
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -22,7 +23,14 @@ from ginn_jax.lane_fields import (
     write_row,
 )
 from ginn_jax.lane_layers import Constants, as_constants, from_constants
-from ginn_jax.lane_rows import in_program, layers_by_jax, params_before, write_layers
+from ginn_jax.lane_rows import (
+    Width,
+    feature_widths,
+    in_program,
+    layers_by_jax,
+    params_before,
+    write_layers,
+)
 from ginn_jax.lanes import (
     Lane,
     Lanes,
@@ -43,24 +51,22 @@ from ginn_jax.receptive_field import Oriented
 MOST_SUMS = 96
 
 Numbers = Float[np.ndarray, "_ _ _"] | None
-Areas = dict[int, Float[np.ndarray, "_"]]
 
 
-class Points(NamedTuple):
-    """The points of every level, position and normal of each in a lane, the area that
-    they stand for, and those sorted already, by the name of the convolution."""
+class Level(NamedTuple):
+    """Points of a level.
 
-    levels: list[Oriented]
-    lanes: list[Lanes]
-    area: Areas
+    rows    which of the cloud's they are
+    lanes   position and normal of each
+    area    that they stand for, under way, where it is asked for, else None
+    tables  points sorted already, by the name of the convolution
+    """
+
+    rows: Int[np.ndarray, "_"]
+    points: Oriented
+    lanes: Lanes
+    area: Lane
     tables: dict[str, Sorted]
-
-
-class Width(NamedTuple):
-    """How many free features, and how many light ones."""
-
-    free: int
-    light: int
 
 
 # Features side by side as skips leave them: free and light ones of each part, a row
@@ -72,27 +78,33 @@ def convolve(
     dr: Any,
     network: Network,
     weights: Any,
-    points: Points,
+    finest: Level,
+    coarser: Iterator[Level],
     material: Numbers,
     light: Numbers,
-) -> Code:
-    """The codes of the finest points, of every channel; `weights`: those of f_3D."""
+) -> tuple[Code, list[Level]]:
+    """The codes of the finest points, of every channel, and all levels; each is made
+    when it is asked for. `weights`: those of f_3D."""
     weights, channels = jax.device_get(weights), 1 if light is None else len(light)
-    parts = [_enter(dr, network, points.levels[0].normal, material, light)]
+    parts = [_enter(dr, network, finest.points.normal, material, light)]
     done: dict[str, Parts] = {}
-    *widths, last = feature_widths(network)
+    levels, (*widths, last) = [finest], feature_widths(network)
     for conv, width in zip(network.encoder, widths, strict=True):
-        given = dr, network, conv, width, weights, points, parts, channels
+        while len(levels) <= max(conv.source, conv.target):
+            levels.append(next(coarser))
+        ends = levels[conv.source], levels[conv.target]
+        given = dr, network, conv, width, weights, *ends, parts, channels
         before = done[conv.skip] if conv.skip else []
         parts = done[conv.name] = [*before, _convolution(*given)]
-    count = len(points.levels[0].mask)
+    count = len(finest.rows)
     own = None if light is None else flat(dr, light)
     rows = np.arange(channels * count).reshape(channels, count)
     codes = _layers(dr, network, None, weights, parts, own, rows, sum(last)).numpy()
     codes = codes.reshape(channels, count, -1)
-    return Code(
+    code = Code(
         codes[..., : last.free], codes[..., last.free :] if last.light else None
     )
+    return code, [*levels, *coarser]
 
 
 def _convolution(
@@ -101,17 +113,18 @@ def _convolution(
     conv: Conv,
     width: Width,
     weights: Any,
-    points: Points,
+    senders: Level,
+    receivers: Level,
     parts: Parts,
     channels: int,
 ) -> list[Any]:
     """What it makes of all `parts` so far."""
-    senders, area = points.levels[conv.source], points.area[conv.source]
-    found = points.tables.get(conv.name)
+    points, area = senders.points, senders.area
+    found = senders.tables.get(conv.name)
     if found is None:
         far = reach(conv.radius, network.taper)
-        found = sort_points(senders.position, senders.mask, far)
-    table = weighed(dr, found, senders, area, conv.radius)
+        found = sort_points(points.position, points.mask, far)
+    table = weighed(dr, found, points, area.numpy(), conv.radius)
     rows = found.rows + len(found.rows) * np.arange(channels)[:, None]
     stride = in_packets(sum(width))
     features = _layers(dr, network, conv, weights, parts, None, rows, stride)
@@ -119,26 +132,7 @@ def _convolution(
     shape = conv.radius, network.taper, sum(width), together, channels
     sum_ = Sum(network.oriented, *shape)
     kernel = as_constants(weights[conv.name]["kernel"])
-    ends = table, features, points.lanes[conv.target]
-    return _sums(dr, sum_, width, kernel, *ends)
-
-
-def feature_widths(network: Network) -> list[Width]:
-    """Of what each convolution is given and leaves, and of the codes."""
-    free = 3 + network.materials + (0 if network.linear else network.lights)
-    light = network.lights if network.linear or network.beams else 0
-    found, done = [], dict[str, Width]()
-    for conv in network.encoder:
-        if conv.before in ("dense", "lift"):
-            free, light = conv.channels, light and (network.beams or conv.channels)
-        found.append(Width(free, light))
-        skipped = done[conv.skip] if conv.skip else Width(0, 0)
-        free, light = done[conv.name] = Width(
-            free + skipped.free, light + skipped.light
-        )
-    beams = light and (network.beams or network.latent)
-    own = network.lights if network.local else 0
-    return [*found, Width(network.latent, own + beams)]
+    return _sums(dr, sum_, width, kernel, table, features, receivers.lanes)
 
 
 def _enter(

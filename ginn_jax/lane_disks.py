@@ -4,7 +4,7 @@ What becomes of a sample depends on those thrown before it alone. So the first q
 is decided by itself, among fewer, and of the rest most are dropped by those it kept.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,13 +19,12 @@ from ginn_jax.cells import (
     thinned,
 )
 from ginn_jax.hierarchy import DROPPED, HOLD, KEPT, WAITING, thrown_first
+from ginn_jax.lane_loops import for_each_around
 from ginn_jax.lanes import (
-    COLUMNS,
     Lane,
     Lanes,
     Table,
     program,
-    runs_of,
     side_by_side,
     table_in,
 )
@@ -62,9 +61,10 @@ def levels_in_lanes(
     normal: Float[np.ndarray, "N 3"],
     lots: Sequence[UInt32[Any, "R"]],
     kept_before: Bool[np.ndarray, "L R"] | None,
-) -> list[Int[np.ndarray, "_"]]:
-    """The samples that each level keeps, finest first, neighbours together."""
-    levels, rows = [], np.arange(len(position))
+) -> Iterator[Int[np.ndarray, "_"]]:
+    """The samples that each level keeps, finest first, neighbours together: chosen when
+    they are asked for, so that a level can be used while NumPy sorts for the next."""
+    rows = np.arange(len(position))
     moved = kept_before is not None
     for i, radius in enumerate(network.levels):
         before = None if kept_before is None else kept_before[i, rows]
@@ -72,8 +72,7 @@ def levels_in_lanes(
         ends = position.take(rows, 0), normal.take(rows, 0), lot, rows
         disk = Disk(radius, network.sided, moved)
         rows = rows[sample_disk_in_lanes(dr, disk, *ends)]
-        levels.append(rows)
-    return levels
+        yield rows
 
 
 def sample_disk_in_lanes(
@@ -112,11 +111,12 @@ def _darts(
     name: Int[np.ndarray, "N"],
 ) -> Darts:
     """The samples in the order of their cells."""
-    found = [
+    place, facing = (
         side_by_side([row, last.view(np.float32)[:, None]], cells.order, 4)
         for row, last in ((position, lot), (normal, name.astype(np.uint32)))
-    ]
-    return Darts(*found, [dr.llvm.Float(np.ravel(a)) for a in found])
+    )
+    lanes = [dr.llvm.Float(np.ravel(a)) for a in (place, facing)]
+    return Darts(place, facing, lanes)
 
 
 def _elect(
@@ -175,9 +175,8 @@ def _best(
     t, searched = dr.llvm, Table(*table)
     (*place, lot), (*normal, name) = (dr.gather(t.Array4f, a, asked) for a in darts)
     lot, name = (dr.reinterpret_array(t.UInt32, a) for a in (lot, name))
-    run_of = runs_of(dr, searched, place)
 
-    def test(row: Lane, stop: Lane, best: Lane) -> tuple:
+    def test(row: Lane, best: Lanes) -> Lanes:
         found = dr.gather(t.Array4f, searched.place, row)
         other = dr.reinterpret_array(t.UInt32, found[3])
         squared = sum((x - found[i]) ** 2 for i, x in enumerate(place))
@@ -188,23 +187,11 @@ def _best(
         if disk.sided:
             conflict &= sum(normal[i] * facing[i] for i in range(3)) >= 0
         seen = dr.gather(t.UInt32, state, row, conflict)
-        return row + 1, stop, dr.maximum(best, seen)
+        return [dr.maximum(best[0], seen)]
 
-    def through(column: Lane, best: Lane) -> tuple:
-        # Its own column first: what is near decides.
-        row, stop = run_of((column + COLUMNS // 2) % COLUMNS, t.Bool(True))
-        *_, best = dr.while_loop(
-            (row, stop, best),
-            lambda row, stop, best: (row < stop) & (best < enough),
-            test,
-        )
-        return column + 1, best
-
-    zero = dr.zeros(t.UInt32, dr.width(asked))
-    _, best = dr.while_loop(
-        (zero, zero),
-        lambda column, best: (column < COLUMNS) & (best < enough),
-        through,
+    start = [dr.zeros(t.UInt32, dr.width(asked))]
+    (best,) = for_each_around(
+        dr, searched, place, test, start, lambda best: best[0] < enough
     )
     undecided = dr.select(best < WAITING, t.UInt32(KEPT), t.UInt32(WAITING))
     return dr.select(best == KEPT, t.UInt32(DROPPED), undecided)

@@ -4,6 +4,7 @@ The codes are those of `shading.encode` but for rounding. There are no lists of 
 hence no capacities, and no gradient.
 """
 
+import itertools
 from functools import partial
 from typing import Any
 
@@ -15,11 +16,9 @@ from ginn_jax.architecture import Network, reach
 from ginn_jax.facets import Around
 from ginn_jax.hierarchy import draw_lots
 from ginn_jax.lane_convolutions import (
-    Areas,
+    Level,
     Numbers,
-    Points,
     convolve,
-    feature_widths,
 )
 from ginn_jax.lane_disks import levels_in_lanes
 from ginn_jax.lane_fields import (
@@ -33,7 +32,8 @@ from ginn_jax.lane_fields import (
     simple_enough,
     smoothed,
 )
-from ginn_jax.lanes import Lane, Lanes, Sorted, Table, program, sort_points
+from ginn_jax.lane_rows import feature_widths
+from ginn_jax.lanes import Lane, Lanes, Table, program, sort_points
 from ginn_jax.neighbors import bucket
 from ginn_jax.network import Code, Variables
 from ginn_jax.receptive_field import Oriented
@@ -72,27 +72,26 @@ def encode_in_lanes(
     # Drawn in the background, level after level.
     lots = [_lots(bucket(count), i, key) for i in range(len(network.levels))]
     before = None if kept_before is None else np.asarray(kept_before)
-    rows = levels_in_lanes(dr, network, cloud.position, cloud.normal, lots, before)
+    chosen = levels_in_lanes(dr, network, cloud.position, cloud.normal, lots, before)
     # Copied: the caller may write on.
     kept = jax.tree.map(np.array, (cloud, light)) if network.smooth else None
     around = None if kept is None else Around(kept[0], None, kept[1])
-    material, given = (_take(a, rows[0]) for a in (material, light))
+    rows = next(chosen)
+    material, given = (_take(a, rows) for a in (material, light))
     if around is not None:
-        cloud, given = _smooth(dr, network, around, rows[0], given)
+        cloud, given = _smooth(dr, network, around, rows, given)
     scale = None
     if light is not None and given is not None:
         scale = (light[..., 0] / np.float32(count)).sum(axis=1)
         given = given * safe_inverses(scale)[:, None, None]
-    levels = [Oriented(*(a.take(some, 0) for a in cloud)) for some in rows]
-    lanes = [_ends_of(dr, level) for level in levels]
-    area, tables = _areas(dr, network, levels, lanes)
-    points = Points(levels, lanes, area, tables)
-    weights = variables["encoder"]["params"]
-    free, beams = convolve(dr, network, weights, points, material, given)
+    levels = map(partial(_level, dr, network, cloud), itertools.count(1), chosen)
+    finest = _level(dr, network, cloud, 0, rows)
+    ends = variables["encoder"]["params"], finest, levels, material, given
+    (free, beams), made = convolve(dr, network, *ends)
     if scale is None:
         free = free[0]
-    ends = levels[0], None, area[0], Code(free, beams), scale
-    return Encoded(*ends, around=around, kept=_named(rows, bucket(count)))
+    codes = finest.points, None, finest.area.numpy(), Code(free, beams), scale
+    return Encoded(*codes, around=around, kept=_named(made, bucket(count)))
 
 
 @partial(jax.jit, static_argnums=0)
@@ -101,11 +100,11 @@ def _lots(count: int, level: Any, key: Key[Array, ""]) -> Any:
     return draw_lots(count, key=jax.random.fold_in(key, level))
 
 
-def _named(rows: list[Int[np.ndarray, "_"]], count: int) -> Bool[np.ndarray, "L R"]:
+def _named(levels: list[Level], count: int) -> Bool[np.ndarray, "L R"]:
     """Which names are among the rows of each level."""
-    kept = np.zeros((len(rows), count), bool)
-    for level, some in zip(kept, rows, strict=True):
-        level[some] = True
+    kept = np.zeros((len(levels), count), bool)
+    for among, level in zip(kept, levels, strict=True):
+        among[level.rows] = True
     return kept
 
 
@@ -152,18 +151,18 @@ def _smoothed(
     return [query.normal, *query.light]
 
 
-def _areas(
-    dr: Any, network: Network, levels: list[Oriented], lanes: list[Lanes]
-) -> tuple[Areas, dict[str, Sorted]]:
-    """The area that points stand for, of each level that needs to know, and the points
-    sorted for the convolutions within levels."""
-    within = [c for c in network.encoder if c.source == c.target]
-    within += [area_search(network)] if needs_areas(network) else []
-    found, tables = {}, {}
+def _level(
+    dr: Any, network: Network, cloud: Oriented, number: int, rows: Int[np.ndarray, "M"]
+) -> Level:
+    """A level of these rows of the cloud."""
+    points = Oriented(*(a.take(rows, 0) for a in cloud))
+    lanes, area, tables = _ends_of(dr, points), None, {}
+    within = [c for c in network.encoder if c.source == c.target == number]
+    if number == 0 and needs_areas(network):
+        within += [area_search(network)]
     for conv in within:
-        points, far = levels[conv.source], reach(conv.radius, network.taper)
+        far = reach(conv.radius, network.taper)
         tables[conv.name] = sort_points(points.position, points.mask, far)
-        ends = points, lanes[conv.source], conv.radius, network.sided
-        found[conv.source] = areas(dr, tables[conv.name], *ends)
-    # All are under way before the first is waited for.
-    return {level: lane.numpy() for level, lane in found.items()}, tables
+        ends = points, lanes, conv.radius, network.sided
+        area = areas(dr, tables[conv.name], *ends)
+    return Level(rows, points, lanes, area, tables)

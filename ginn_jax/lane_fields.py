@@ -12,15 +12,17 @@ from ginn_jax.cells import in_line
 from ginn_jax.errors import InputError
 from ginn_jax.facets import OWN, Around
 from ginn_jax.lane_layers import dot, perceptron
+from ginn_jax.lane_loops import for_each_around, for_each_near
 from ginn_jax.lanes import (
     Lane,
     Lanes,
     Sorted,
     Table,
-    for_each_near,
     program,
     read_record,
+    side_by_side,
     sort_points,
+    table_in,
     table_of,
 )
 from ginn_jax.process import LOG, on_cpu
@@ -149,22 +151,25 @@ def areas(
     dr: Any, found: Sorted, points: Oriented, lanes: Lanes, radius: float, sided: bool
 ) -> Lane:
     """The area that each of the points stands for: `receptive_field.point_area`."""
-    table = table_of(dr, found, points[:2])
+    facing = side_by_side([points.normal], found.rows, 4)
+    table = table_in(dr, found.cells, found.place, facing)
     return program(_area, radius, sided)(list(table), lanes)
 
 
 def _area(dr: Any, radius: float, sided: bool, table: Lanes, lanes: Lanes) -> Lane:
-    searched = Table(*table)
+    t, searched = dr.llvm, Table(*table)
 
-    def visit(row: Lane, totals: Lanes) -> Lanes:
-        record = own_record(dr, searched, row)
-        apart = [a - b for a, b in zip(lanes[:3], record[:3], strict=True)]
+    def visit(row: Lane, total: Lanes) -> Lanes:
+        there = dr.gather(t.Array4f, searched.place, row)
+        apart = [a - there[i] for i, a in enumerate(lanes[:3])]
         value = dr.maximum(1 - dot(apart, apart) / radius**2, 0) ** 2
         if sided:
-            value = dr.select(dot(lanes[3:], record[3:6]) >= 0, value, 0)
-        return [totals[0] + value]
+            facing = dr.gather(t.Array4f, searched.record, row)
+            value = dr.select(dot(lanes[3:], list(facing)[:3]) >= 0, value, 0)
+        return [total[0] + value]
 
-    (total,), _ = for_each_near(dr, searched, radius, lanes[:3], visit, 1)
+    start = [dr.zeros(t.Float, dr.width(lanes[0]))]
+    (total,) = for_each_around(dr, searched, lanes[:3], visit, start)
     return np.pi * radius**2 / 3 / dr.maximum(total, 1)
 
 

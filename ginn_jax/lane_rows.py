@@ -5,7 +5,7 @@ millisecond a weight to compile: large layers, which few points have, are JAX's.
 """
 
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,31 @@ from ginn_jax.network import Code, Latent, McConv, join
 
 # Weights of the layers before a convolution that are in lanes.
 MOST_WEIGHTS = 1 << 12
+
+
+class Width(NamedTuple):
+    """How many free features, and how many light ones."""
+
+    free: int
+    light: int
+
+
+def feature_widths(network: Network) -> list[Width]:
+    """Of what each convolution is given and leaves, and of the codes."""
+    free = 3 + network.materials + (0 if network.linear else network.lights)
+    light = network.lights if network.linear or network.beams else 0
+    found, done = [], dict[str, Width]()
+    for conv in network.encoder:
+        if conv.before in ("dense", "lift"):
+            free, light = conv.channels, light and (network.beams or conv.channels)
+        found.append(Width(free, light))
+        skipped = done[conv.skip] if conv.skip else Width(0, 0)
+        free, light = done[conv.name] = Width(
+            free + skipped.free, light + skipped.light
+        )
+    beams = light and (network.beams or network.latent)
+    own = network.lights if network.local else 0
+    return [*found, Width(network.latent, own + beams)]
 
 
 def params_before(weights: Any, conv: Conv | None) -> Any:

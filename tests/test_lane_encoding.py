@@ -163,7 +163,7 @@ def shapes(presets_of):
 )
 def test_widths_are_those_of_the_layers(presets_of):
     for network, params in shapes(presets_of):
-        *widths, last = lane_convolutions.feature_widths(network)
+        *widths, last = lane_rows.feature_widths(network)
         for conv, width in zip(network.encoder, widths, strict=True):
             *_, bias = params[conv.name]["kernel"]
             assert bias.shape[0] * bias.shape[1] >= sum(width)

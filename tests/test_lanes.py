@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from strategies import FACES, FAR, RADII, UNIT, clouds, coordinates
 
-from ginn_jax import cells, lanes
+from ginn_jax import cells, lane_loops, lanes
 from ginn_jax.renderer import use_drjit
 
 FACTORS = st.sampled_from([1.0, 1e-6, 1e6])
@@ -26,7 +26,8 @@ def scenes(draw):
 
 
 def loop(points, mask, queries, radius):
-    """How many points each query finds, and sums of two numbers that they have."""
+    """How many points each query finds, sums of two numbers that they have, and how
+    many are near of those around."""
     dr = use_drjit()
     t = dr.llvm
     number = np.arange(1, len(points) + 1, dtype=np.float32)[:, None]
@@ -42,9 +43,16 @@ def loop(points, mask, queries, radius):
         record = lanes.read_record(dr, table.record, len(rows), row)
         return [a + b for a, b in zip(totals, record[3:5], strict=True)]
 
-    totals, found = lanes.for_each_near(dr, table, radius, place, visit, 2)
-    dr.eval(totals, found)
-    return [a.numpy() for a in (found, *totals)]
+    def count(row, total):
+        there = dr.gather(t.Array4f, table.place, row)
+        squared = sum((x - there[i]) ** 2 for i, x in enumerate(place))
+        return [total[0] + dr.select(squared < radius**2, 1, 0)]
+
+    totals, found = lane_loops.for_each_near(dr, table, radius, place, visit, 2)
+    zero = dr.zeros(t.Float, len(queries))
+    around = lane_loops.for_each_around(dr, table, place, count, [zero])
+    dr.eval(totals, found, around)
+    return [a.numpy() for a in (found, *totals, *around)]
 
 
 def check(points, mask, queries, radius):
@@ -53,8 +61,9 @@ def check(points, mask, queries, radius):
     near, maybe = distance < 1 - 1e-5, distance < 1 + 1e-5
     number = np.flatnonzero(mask) + 1.0
     found = loop(points, mask, queries, radius)
-    for values, each in zip(found, (number**0, number, number * 37 % 101), strict=True):
-        # What is at exactly the radius may count or not, but in all three.
+    summed = number**0, number, number * 37 % 101, number**0
+    for values, each in zip(found, summed, strict=True):
+        # What is at exactly the radius may count or not, but in all.
         assert (values >= near @ each - 0.5).all()
         assert (values <= maybe @ each + 0.5).all()
         certain = (near == maybe).all(axis=1)
@@ -66,9 +75,28 @@ def test_each_point_near_is_visited_once(scene):
     check(*scene)
 
 
+def test_a_lane_that_has_seen_enough_goes_no_further():
+    """Of a crowd that all are near, each lane counts as many as it wants."""
+    dr = use_drjit()
+    t, points = dr.llvm, np.zeros((50, 3), np.float32)
+    found = lanes.sort_points(points, np.ones(50, bool), 1.0)
+    table = lanes.table_of(dr, found, [points])
+    wanted = t.UInt32([0, 1, 7, 50, 99])
+    zero = dr.zeros(t.UInt32, 5)
+    (count,) = lane_loops.for_each_around(
+        dr,
+        table,
+        [dr.zeros(t.Float, 5)] * 3,
+        lambda row, count: [count[0] + 1],
+        [zero],
+        lambda count: count[0] < wanted,
+    )
+    np.testing.assert_array_equal(count.numpy(), [0, 1, 7, 50, 50])
+
+
 @pytest.mark.parametrize("noted", [1, 2, 5])
 def test_no_note_is_lost_where_there_is_room_for_few(noted, monkeypatch):
-    monkeypatch.setattr(lanes, "NOTED", noted)
+    monkeypatch.setattr(lane_loops, "NOTED", noted)
     rng = np.random.default_rng(0)
     points, queries = (rng.uniform(size=(n, 3)).astype(np.float32) for n in (400, 50))
     crowd = np.concatenate([points, np.repeat(points[:1], 100, axis=0)])
