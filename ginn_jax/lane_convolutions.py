@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from ginn_jax.architecture import Conv, Network, reach
+from ginn_jax.architecture import Conv, Network
 from ginn_jax.cells import in_line
 from ginn_jax.lane_fields import (
     Sum,
@@ -40,7 +40,6 @@ from ginn_jax.lanes import (
     in_packets,
     program,
     side_by_side,
-    sort_points,
 )
 from ginn_jax.neighbors import bucket
 from ginn_jax.network import Code
@@ -59,7 +58,7 @@ class Level(NamedTuple):
     rows    which of the cloud's they are
     lanes   position and normal of each
     area    that they stand for, under way, where it is asked for, else None
-    tables  points sorted already, by the name of the convolution
+    tables  points sorted, by the name of the convolution
     """
 
     rows: Int[np.ndarray, "_"]
@@ -120,10 +119,7 @@ def _convolution(
 ) -> list[Any]:
     """What it makes of all `parts` so far."""
     points, area = senders.points, senders.area
-    found = senders.tables.get(conv.name)
-    if found is None:
-        far = reach(conv.radius, network.taper)
-        found = sort_points(points.position, points.mask, far)
+    found = senders.tables[conv.name]
     table = weighed(dr, found, points, area.numpy(), conv.radius)
     rows = found.rows + len(found.rows) * np.arange(channels)[:, None]
     stride = in_packets(sum(width))

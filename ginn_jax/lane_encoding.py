@@ -154,15 +154,16 @@ def _smoothed(
 def _level(
     dr: Any, network: Network, cloud: Oriented, number: int, rows: Int[np.ndarray, "M"]
 ) -> Level:
-    """A level of these rows of the cloud."""
+    """A level of these rows of the cloud, sorted for all that is summed over it."""
     points = Oriented(*(a.take(rows, 0) for a in cloud))
     lanes, area, tables = _ends_of(dr, points), None, {}
-    within = [c for c in network.encoder if c.source == c.target == number]
-    if number == 0 and needs_areas(network):
-        within += [area_search(network)]
-    for conv in within:
+    ends = points, lanes
+    weighing = [area_search(network)] if needs_areas(network) else []
+    from_here = [c for c in (*weighing, *network.encoder) if c.source == number]
+    # The area first: it is summed while the rest is sorted.
+    for conv in sorted(from_here, key=lambda conv: conv.target != number):
         far = reach(conv.radius, network.taper)
         tables[conv.name] = sort_points(points.position, points.mask, far)
-        ends = points, lanes, conv.radius, network.sided
-        area = areas(dr, tables[conv.name], *ends)
+        if conv.target == number:
+            area = areas(dr, tables[conv.name], *ends, conv.radius, network.sided)
     return Level(rows, points, lanes, area, tables)
