@@ -17,14 +17,13 @@ from ginn_jax.lane_fields import (
     Sum,
     entries,
     field_sum,
-    flat,
     points_in,
     weighed,
-    write_row,
 )
 from ginn_jax.lane_layers import Constants, as_constants, from_constants
 from ginn_jax.lane_rows import (
     Width,
+    as_code,
     feature_widths,
     in_program,
     layers_by_jax,
@@ -39,7 +38,9 @@ from ginn_jax.lanes import (
     blank,
     in_packets,
     program,
+    records,
     side_by_side,
+    write_record,
 )
 from ginn_jax.neighbors import bucket
 from ginn_jax.network import Code
@@ -68,9 +69,10 @@ class Level(NamedTuple):
     tables: dict[str, Sorted]
 
 
-# Features side by side as skips leave them: free and light ones of each part, a row
-# after the other, channel after channel, in Dr.Jit's memory.
-Parts = list[list[Any]]
+# Records of features, channel after channel, in Dr.Jit's memory, and how wide they are;
+# side by side as skips leave them.
+Part = tuple[Width, Any]
+Parts = list[Part]
 
 
 def convolve(
@@ -96,14 +98,10 @@ def convolve(
         before = done[conv.skip] if conv.skip else []
         parts = done[conv.name] = [*before, _convolution(*given)]
     count = len(finest.rows)
-    own = None if light is None else flat(dr, light)
+    own = None if light is None else records(dr, [light])
     rows = np.arange(channels * count).reshape(channels, count)
-    codes = _layers(dr, network, None, weights, parts, own, rows, sum(last)).numpy()
-    codes = codes.reshape(channels, count, -1)
-    code = Code(
-        codes[..., : last.free], codes[..., last.free :] if last.light else None
-    )
-    return code, [*levels, *coarser]
+    codes = _layers(dr, network, None, last, weights, parts, own, rows).numpy()
+    return as_code(last, codes.reshape(channels, count, -1)), [*levels, *coarser]
 
 
 def _convolution(
@@ -116,19 +114,18 @@ def _convolution(
     receivers: Level,
     parts: Parts,
     channels: int,
-) -> list[Any]:
+) -> Part:
     """What it makes of all `parts` so far."""
     points, area = senders.points, senders.area
     found = senders.tables[conv.name]
     table = weighed(dr, found, points, area.numpy(), conv.radius)
     rows = found.rows + len(found.rows) * np.arange(channels)[:, None]
-    stride = in_packets(sum(width))
-    features = _layers(dr, network, conv, weights, parts, None, rows, stride)
+    features = _layers(dr, network, conv, width, weights, parts, None, rows)
     together = channels if channels * sum(width) <= MOST_SUMS else 1
     shape = conv.radius, network.taper, sum(width), together, channels
     sum_ = Sum(network.oriented, *shape)
     kernel = as_constants(weights[conv.name]["kernel"])
-    return _sums(dr, sum_, width, kernel, table, features, receivers.lanes)
+    return width, _sums(dr, sum_, kernel, table, features, receivers.lanes)
 
 
 def _enter(
@@ -137,38 +134,42 @@ def _enter(
     normal: Float[np.ndarray, "N 3"],
     material: Numbers,
     light: Numbers,
-) -> list[Any]:
+) -> Part:
     """What the points show f_3D of themselves: `network.enter`."""
-    if light is None:
-        return [flat(dr, normal), None]
-    shown = [np.broadcast_to(normal, (len(light), *normal.shape)), material]
-    shown += [None if network.linear else light]
-    free = np.concatenate([a for a in shown if a is not None], axis=2)
-    linear = network.linear or network.beams
-    return [flat(dr, free), flat(dr, light) if linear else None]
+    free, beams = [normal], []
+    if light is not None:
+        free = [np.broadcast_to(normal, (len(light), *normal.shape))]
+        free += [
+            a for a in (material, None if network.linear else light) if a is not None
+        ]
+        beams = [light] if network.linear or network.beams else []
+    width = Width(*(sum(a.shape[-1] for a in part) for part in (free, beams)))
+    return width, records(dr, free + beams)
 
 
 def _layers(
     dr: Any,
     network: Network,
     conv: Conv | None,
+    width: Width,
     weights: Any,
     parts: Parts,
     light: Any,
     rows: Int[np.ndarray, "C M"],
-    stride: int,
 ) -> Any:
     """What a convolution is given of these rows of all channels, or the code; `light`:
     the points' own."""
     params, order = params_before(weights, conv), rows.reshape(-1)
     if not in_program(params):
         found = _rows_by_jax(network, conv, params, parts, light, rows.shape)
-        return dr.llvm.Float(side_by_side([found], order, stride).reshape(-1))
+        return dr.llvm.Float(side_by_side([found], order).reshape(-1))
     place = np.empty(rows.size, np.uint32)
     place[order] = np.arange(rows.size, dtype=np.uint32)
     place = dr.llvm.UInt32(in_line(place))
-    run = program(write_layers, network, conv, as_constants(params), stride)
-    return run(parts, light, place, blank(dr, rows.size * stride))
+    widths, given = (list(a) for a in zip(*parts, strict=True))
+    known = network, conv, as_constants(params), tuple(widths)
+    to = blank(dr, rows.size * in_packets(sum(width)))
+    return program(write_layers, *known)(given, light, place, to)
 
 
 def _rows_by_jax(
@@ -183,11 +184,12 @@ def _rows_by_jax(
     more = bucket(shape[1]) - shape[1]
 
     def padded(numbers: Any) -> Any:
-        if numbers is None:
-            return None
-        return np.pad(numbers.numpy().reshape(*shape, -1), [(0, 0), (0, more), (0, 0)])
+        rows = numbers.numpy().reshape(*shape, -1)
+        return np.pad(rows, [(0, 0), (0, more), (0, 0)])
 
-    given = tuple(Code(*map(padded, part)) for part in parts), padded(light)
+    codes = tuple(as_code(width, padded(part)) for width, part in parts)
+    own = None if light is None else padded(light)[..., : network.lights]
+    given = codes, own
     found = layers_by_jax(network, conv, params, *given)
     both = [np.asarray(a)[:, : shape[1]] for a in found if a is not None]
     return np.concatenate(both, axis=2).reshape(shape[0] * shape[1], -1)
@@ -196,44 +198,39 @@ def _rows_by_jax(
 def _sums(
     dr: Any,
     sum_: Sum,
-    width: Width,
     kernel: Constants,
     table: Table,
     features: Any,
     receivers: Lanes,
-) -> list[Any]:
+) -> Any:
     """What a convolution leaves of every channel, of some at a time."""
     t, rows, points = dr.llvm, dr.width(receivers[0]), points_in(dr, table)
-    count = sum_.all_channels * rows
-    part = [blank(dr, count * n) if n else None for n in width]
-    run = program(_convolved, sum_, width, kernel)
+    left = blank(dr, sum_.all_channels * rows * in_packets(sum_.width))
+    run = program(_convolved, sum_, kernel)
     for some in np.arange(sum_.all_channels, dtype=np.uint32).reshape(
         -1, sum_.channels
     ):
         starts = (t.UInt32(in_line(some * np.uint32(n))) for n in (points, rows))
-        part = run(list(table), features, *starts, receivers, part)
-    return part
+        left = run(list(table), features, *starts, receivers, left)
+    return left
 
 
 def _convolved(
     dr: Any,
     sum_: Sum,
-    width: Width,
     kernel: Constants,
     table: Lanes,
     features: Any,
     given: Lane,
-    left: Lane,
+    to: Lane,
     ends: Lanes,
-    part: list[Any],
-) -> list[Any]:
-    """The program: sums, written where there is nothing yet; `given`, `left`: where
-    the channels begin."""
+    blank: Any,
+) -> Any:
+    """The program: sums, written where there is nothing yet; `given`, `to`: where the
+    channels begin."""
     weights, lane = from_constants(kernel), dr.arange(dr.llvm.UInt32, dr.width(ends[0]))
     totals, _ = field_sum(dr, sum_, weights, Table(*table), features, given, ends)
-    for start in entries(dr, left, sum_.channels):
-        place = lane + start
-        for numbers, count in zip(part, width, strict=True):
-            row, totals = totals[:count], totals[count:]
-            write_row(dr, numbers, row, place, count)
-    return part
+    for i, start in enumerate(entries(dr, to, sum_.channels)):
+        row = totals[i * sum_.width : (i + 1) * sum_.width]
+        write_record(dr, blank, row, lane + start)
+    return blank

@@ -107,14 +107,6 @@ def entries(dr: Any, numbers: Any, count: int) -> Lanes:
     return [dr.gather(type(numbers), numbers, i) for i in index]
 
 
-def write_row(dr: Any, blank: Any, numbers: Lanes, to: Lane, stride: int) -> None:
-    """Numbers of each lane `to` a row where there is nothing yet, `stride` a row."""
-    for i, number in enumerate(numbers):
-        place = to * stride + i
-        # All at once: one after the other they would be as many programs.
-        dr.scatter(blank, number, place, mode=dr.ReduceMode.Permute)
-
-
 def around_table(dr: Any, network: Network, around: Around, lit: bool) -> Table:
     """The samples around with their normals and, where asked for, light."""
     points, _, light = around

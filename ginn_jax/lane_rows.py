@@ -13,9 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ginn_jax.architecture import Conv, Network
-from ginn_jax.lane_fields import read_row, write_row
 from ginn_jax.lane_layers import Constants, dense, from_constants, gate, norm
-from ginn_jax.lanes import Lane, Lanes
+from ginn_jax.lanes import Lane, Lanes, read_record, write_record
 from ginn_jax.network import Code, Latent, McConv, join
 
 # Weights of the layers before a convolution that are in lanes.
@@ -27,6 +26,12 @@ class Width(NamedTuple):
 
     free: int
     light: int
+
+
+def as_code(width: Width, record: Float[np.ndarray, "C N _"]) -> Code:
+    """Features of a record by kind."""
+    light = record[..., width.free : sum(width)]
+    return Code(record[..., : width.free], light if width.light else None)
 
 
 def feature_widths(network: Network) -> list[Width]:
@@ -65,26 +70,28 @@ def write_layers(
     network: Network,
     conv: Conv | None,
     weights: Constants,
-    stride: int,
-    parts: list[list[Any]],
+    widths: tuple[Width, ...],
+    parts: list[Any],
     light: Any,
     to: Lane,
     blank: Any,
 ) -> Any:
-    """The program: what all `parts` have in a row, put through the layers, is written
-    to another, so many numbers a row; `light`: the points' own."""
+    """The program: what all `parts` have in a record, put through the layers, is
+    written to another; `light`: the points' own."""
     rows = dr.width(to)
     lane = dr.arange(dr.llvm.UInt32, rows)
-
-    def read(numbers: Any) -> Lanes:
-        if numbers is None:
-            return []
-        return read_row(dr, numbers, dr.width(numbers) // rows, lane)
-
-    free, beams = ([x for part in parts for x in read(part[i])] for i in range(2))
+    read = [read_record(dr, part, rows, lane) for part in parts]
+    free = [x for w, row in zip(widths, read, strict=True) for x in row[: w.free]]
+    beams = [
+        x for w, row in zip(widths, read, strict=True) for x in row[w.free : sum(w)]
+    ]
+    own = [] if light is None else read_record(dr, light, rows, lane)
     given = dr, network, from_constants(weights), Code(free, beams or None)
-    found = _latent(*given, read(light)) if conv is None else _before(*given, conv)
-    write_row(dr, blank, [*found.free, *(found.light or [])], to, stride)
+    if conv is None:
+        found = _latent(*given, own[: network.lights])
+    else:
+        found = _before(*given, conv)
+    write_record(dr, blank, [*found.free, *(found.light or [])], to)
     return blank
 
 

@@ -138,6 +138,12 @@ def blank(dr: Any, count: int) -> Any:
     return dr.llvm.Float(aligned(1, count)[0])
 
 
+def records(dr: Any, columns: Sequence[Float[np.ndarray, "*C N _"]]) -> Any:
+    """Rows of these columns side by side, for Dr.Jit."""
+    rows = np.arange(columns[0].shape[-2])
+    return dr.llvm.Float(side_by_side(columns, rows).reshape(-1))
+
+
 def in_packets(count: int, packet: int = PACKET) -> int:
     """So many numbers, and those that fill the last packet."""
     return -(-count // packet) * packet
@@ -152,3 +158,16 @@ def read_record(dr: Any, records: Any, count: int, row: Lane) -> Lanes:
         part = dr.gather(dr.llvm.ArrayXf, records, place, shape=(PACKET, lanes))
         found += [part[i] for i in range(PACKET)]
     return found
+
+
+def write_record(dr: Any, blank: Any, numbers: Lanes, row: Lane) -> None:
+    """Numbers of each lane as a record where there is nothing yet. In packets, for a
+    number by itself takes a jump for each lane."""
+    zero = dr.zeros(dr.llvm.Float, dr.width(row))
+    numbers = numbers + [zero] * (in_packets(len(numbers)) - len(numbers))
+    packets = len(numbers) // PACKET
+    for packet in range(packets):
+        part = dr.llvm.ArrayXf(numbers[packet * PACKET : (packet + 1) * PACKET])
+        place = row * packets + packet
+        # All at once: one after the other they would be as many programs.
+        dr.scatter(blank, part, place, mode=dr.ReduceMode.Permute)
