@@ -79,7 +79,7 @@ def aligned(rows: int, width: int) -> Float[np.ndarray, "M _"]:
 def rows_of(
     numbers: Float[np.ndarray, "N K"], rows: Int[np.ndarray, "M"]
 ) -> Float[np.ndarray, "M K"]:
-    """Some rows of numbers in single precision, in such memory."""
+    """Some rows of numbers in single precision, in `aligned` memory."""
     memory = aligned(len(rows), numbers.shape[1])
     # With "raise", NumPy would write them elsewhere first.
     return np.take(numbers, rows, 0, memory, "clip")

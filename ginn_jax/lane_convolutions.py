@@ -1,7 +1,7 @@
 """The convolutions of f_3D in lanes, one after the other, with the layers between.
 
-What one leaves is in Dr.Jit's memory for the next. Nothing waits for a result, but for
-large layers between: while one sums, NumPy sorts the points of the next into cells.
+What one leaves is in Dr.Jit's memory for the next. While one sums, NumPy sorts points
+for others. Only disks and areas of a new level and large layers between wait for it.
 """
 
 from collections.abc import Iterator
@@ -54,18 +54,19 @@ Numbers = Float[np.ndarray, "_ _ _"] | None
 
 
 class Level(NamedTuple):
-    """Points of a level.
+    """Points of a level, ready to be summed.
 
     rows    which of the cloud's they are
-    lanes   position and normal of each
-    area    that they stand for, under way, where it is asked for, else None
+    points  position and normal
+    lanes   the same of each in a lane
+    area    that they stand for; none where no convolution weighs them
     tables  points sorted, by the name of the convolution
     """
 
     rows: Int[np.ndarray, "_"]
     points: Oriented
     lanes: Lanes
-    area: Lane
+    area: Any
     tables: dict[str, Sorted]
 
 
@@ -98,7 +99,7 @@ def convolve(
         before = done[conv.skip] if conv.skip else []
         parts = done[conv.name] = [*before, _convolution(*given)]
     count = len(finest.rows)
-    own = None if light is None else records(dr, [light])
+    own = records(dr, [light]) if light is not None and network.local else None
     rows = np.arange(channels * count).reshape(channels, count)
     codes = _layers(dr, network, None, last, weights, parts, own, rows).numpy()
     return as_code(last, codes.reshape(channels, count, -1)), [*levels, *coarser]
@@ -116,11 +117,10 @@ def _convolution(
     channels: int,
 ) -> Part:
     """What it makes of all `parts` so far."""
-    points, area = senders.points, senders.area
     found = senders.tables[conv.name]
-    table = weighed(dr, found, points, area.numpy(), conv.radius)
     rows = found.rows + len(found.rows) * np.arange(channels)[:, None]
     features = _layers(dr, network, conv, width, weights, parts, None, rows)
+    table = weighed(dr, found, senders.points, senders.area, conv.radius)
     together = channels if channels * sum(width) <= MOST_SUMS else 1
     shape = conv.radius, network.taper, sum(width), together, channels
     sum_ = Sum(network.oriented, *shape)
@@ -163,13 +163,13 @@ def _layers(
     if not in_program(params):
         found = _rows_by_jax(network, conv, params, parts, light, rows.shape)
         return dr.llvm.Float(side_by_side([found], order).reshape(-1))
-    place = np.empty(rows.size, np.uint32)
-    place[order] = np.arange(rows.size, dtype=np.uint32)
-    place = dr.llvm.UInt32(in_line(place))
+    to = np.empty(rows.size, np.uint32)
+    to[order] = np.arange(rows.size, dtype=np.uint32)
+    to = dr.llvm.UInt32(in_line(to))
     widths, given = (list(a) for a in zip(*parts, strict=True))
     known = network, conv, as_constants(params), tuple(widths)
-    to = blank(dr, rows.size * in_packets(sum(width)))
-    return program(write_layers, *known)(given, light, place, to)
+    left = blank(dr, rows.size * in_packets(sum(width)))
+    return program(write_layers, *known)(given, light, to, left)
 
 
 def _rows_by_jax(
@@ -189,8 +189,7 @@ def _rows_by_jax(
 
     codes = tuple(as_code(width, padded(part)) for width, part in parts)
     own = None if light is None else padded(light)[..., : network.lights]
-    given = codes, own
-    found = layers_by_jax(network, conv, params, *given)
+    found = layers_by_jax(network, conv, params, codes, own)
     both = [np.asarray(a)[:, : shape[1]] for a in found if a is not None]
     return np.concatenate(both, axis=2).reshape(shape[0] * shape[1], -1)
 
@@ -224,7 +223,7 @@ def _convolved(
     given: Lane,
     to: Lane,
     ends: Lanes,
-    blank: Any,
+    left: Any,
 ) -> Any:
     """The program: sums, written where there is nothing yet; `given`, `to`: where the
     channels begin."""
@@ -232,5 +231,5 @@ def _convolved(
     totals, _ = field_sum(dr, sum_, weights, Table(*table), features, given, ends)
     for i, start in enumerate(entries(dr, to, sum_.channels)):
         row = totals[i * sum_.width : (i + 1) * sum_.width]
-        write_record(dr, blank, row, lane + start)
-    return blank
+        write_record(dr, left, row, lane + start)
+    return left

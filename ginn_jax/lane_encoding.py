@@ -84,14 +84,13 @@ def encode_in_lanes(
     if light is not None and given is not None:
         scale = (light[..., 0] / np.float32(count)).sum(axis=1)
         given = given * safe_inverses(scale)[:, None, None]
-    levels = map(partial(_level, dr, network, cloud), itertools.count(1), chosen)
     finest = _level(dr, network, cloud, 0, rows)
-    ends = variables["encoder"]["params"], finest, levels, material, given
-    (free, beams), made = convolve(dr, network, *ends)
-    if scale is None:
-        free = free[0]
-    codes = finest.points, None, finest.area.numpy(), Code(free, beams), scale
-    return Encoded(*codes, around=around, kept=_named(made, bucket(count)))
+    coarser = map(partial(_level, dr, network, cloud), itertools.count(1), chosen)
+    inputs = variables["encoder"]["params"], finest, coarser, material, given
+    (free, beams), levels = convolve(dr, network, *inputs)
+    code = Code(free[0] if scale is None else free, beams)
+    known = finest.points, None, finest.area, code, scale
+    return Encoded(*known, around=around, kept=_named(levels, bucket(count)))
 
 
 @partial(jax.jit, static_argnums=0)
@@ -166,4 +165,5 @@ def _level(
         tables[conv.name] = sort_points(points.position, points.mask, far)
         if conv.target == number:
             area = areas(dr, tables[conv.name], *ends, conv.radius, network.sided)
-    return Level(rows, points, lanes, area, tables)
+    # To ask for it later would be to wait for all that is under way by then.
+    return Level(rows, points, lanes, None if area is None else area.numpy(), tables)

@@ -143,7 +143,8 @@ def areas(
     dr: Any, found: Sorted, points: Oriented, lanes: Lanes, radius: float, sided: bool
 ) -> Lane:
     """The area that each of the points stands for: `receptive_field.point_area`."""
-    facing = side_by_side([points.normal], found.rows, 4)
+    # Read only where sides count.
+    facing = side_by_side([points.normal], found.rows, 4) if sided else found.place
     table = table_in(dr, found.cells, found.place, facing)
     return program(_area, radius, sided)(list(table), lanes)
 

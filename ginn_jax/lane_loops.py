@@ -1,8 +1,8 @@
 """Loops over the points near a query, with a query in every lane of a CPU's vectors.
 
 XLA makes lists of candidates and edges, writes them and reads them again. Here each
-lane goes through the points in the cells around its query and works off those that are
-near: no list, hence no capacity.
+lane goes through the points in the cells around its query, and works off those that are
+near or, where that takes no longer than a test, all: no list, hence no capacity.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,7 +37,7 @@ def for_each_near(
         def test(row: Lane, noted: Lane, notes: Any) -> tuple:
             found = dr.gather(t.Array4f, table.place, row)
             near = sum((x - found[i]) ** 2 for i, x in enumerate(place)) < radius**2
-            # Others are overwritten: to store some lanes only is a jump for each.
+            # Others are overwritten: to store what is near only, each lane would jump.
             notes.write(row, noted)
             return row + 1, dr.select(near, noted + 1, noted), notes
 

@@ -74,7 +74,7 @@ def write_layers(
     parts: list[Any],
     light: Any,
     to: Lane,
-    blank: Any,
+    left: Any,
 ) -> Any:
     """The program: what all `parts` have in a record, put through the layers, is
     written to another; `light`: the points' own."""
@@ -91,8 +91,8 @@ def write_layers(
         found = _latent(*given, own[: network.lights])
     else:
         found = _before(*given, conv)
-    write_record(dr, blank, [*found.free, *(found.light or [])], to)
-    return blank
+    write_record(dr, left, [*found.free, *(found.light or [])], to)
+    return left
 
 
 def _before(dr: Any, network: Network, params: Any, x: Code, conv: Conv) -> Code:

@@ -15,8 +15,9 @@ from jaxtyping import Bool, Float, Int
 from ginn_jax.cells import Cells, aligned, sort_into_cells
 from ginn_jax.renderer import use_drjit
 
-# Numbers of a record that are read at once.
-PACKET = 8
+# Numbers of a record that are read or written at once. Columns so narrow that NumPy
+# sorts them faster one by one.
+PACKET, NARROW = 8, 8
 
 # Programs that are kept, with weights of their own: those of a dozen networks.
 PROGRAMS, NEVER = 512, 1 << 30
@@ -59,7 +60,8 @@ def most_held_mib(call: Callable[[], Any]) -> float:
 
 
 class Table(NamedTuple):
-    """Points in cells, in Dr.Jit's memory: where each is, and a record of it.
+    """Points in cells, in Dr.Jit's memory: where each is, and a record of it, of whole
+    packets or, where `for_each_around` goes through them, of four numbers.
 
     `frame` has the low corner of the cells, their rate and how many they are each way.
     """
@@ -123,7 +125,7 @@ def side_by_side(
     table[..., used:] = 0
     for column in columns:
         width = column.shape[-1]
-        if width < PACKET:  # NumPy is faster with few long columns than many short rows
+        if width < NARROW:
             for i in range(width):
                 table[..., place + i] = column[..., i].take(rows, -1)
         else:
@@ -164,7 +166,7 @@ def write_record(dr: Any, blank: Any, numbers: Lanes, row: Lane) -> None:
     """Numbers of each lane as a record where there is nothing yet. In packets, for a
     number by itself takes a jump for each lane."""
     zero = dr.zeros(dr.llvm.Float, dr.width(row))
-    numbers = numbers + [zero] * (in_packets(len(numbers)) - len(numbers))
+    numbers = numbers + [zero] * (-len(numbers) % PACKET)
     packets = len(numbers) // PACKET
     for packet in range(packets):
         part = dr.llvm.ArrayXf(numbers[packet * PACKET : (packet + 1) * PACKET])

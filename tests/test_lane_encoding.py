@@ -142,11 +142,23 @@ def test_wide_layers_sum_a_channel_at_a_time(monkeypatch):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
 
 
-def test_large_layers_of_rows_are_left_to_jax(monkeypatch):
-    given = scene("beams")
+@pytest.mark.parametrize("name", ["beams", "linear", "kernels in blocks"])
+def test_large_layers_of_rows_are_left_to_jax(name, monkeypatch):
+    given = scene(name)
     whole = encode(*given)
     monkeypatch.setattr(lane_rows, "MOST_WEIGHTS", 0)
     assert_alike(given[0], encode(*given), whole)
+
+
+def test_levels_that_nothing_asks_for_are_kept_too():
+    """Without convolutions f_3D is layers of the finest points alone."""
+    network = replace(tiny.NETWORK, encoder=())
+    config = replace(tiny.CONFIG, network=network)
+    variables = jax.device_get(train.init_state(config).variables)
+    given = network, variables, *scene("occlusion")[2:]
+    found = encode(*given)
+    assert_alike(network, found, encode(*given, in_lanes=False))
+    assert len(found.kept) == 2
 
 
 def shapes(presets_of):
@@ -187,10 +199,11 @@ def shifted(numbers):
     return memory[1:].reshape(numbers.shape)
 
 
-def test_nothing_is_traced_twice(monkeypatch):
+@pytest.mark.parametrize("name", ["smooth", "linear"])
+def test_nothing_is_traced_twice(name, monkeypatch):
     """Whatever memory the caller's arrays lie in, and however many points they are; but
     for disks, whose rounds may ask as many samples as they have or have not."""
-    made, given = [], scene("smooth")
+    made, given = [], scene(name)
 
     def kept(function, *static):
         made.append(program(function, *static))
@@ -202,7 +215,7 @@ def test_nothing_is_traced_twice(monkeypatch):
     network, variables, cloud, numbers = given
     encode(*given)
     before = [run.n_recordings for run in made]
-    assert len(before) == 5
+    assert len(before) >= 5
     for count in (1500, 1400, 1300):
         part = cloud._replace(
             position=shifted(cloud.position[:count]),

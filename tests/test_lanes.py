@@ -1,4 +1,4 @@
-"""Loops over the points near a query visit each of those once, and no other."""
+"""Loops over the points near a query or around it, cells, and what they read."""
 
 import numpy as np
 import pytest
@@ -76,22 +76,62 @@ def test_each_point_near_is_visited_once(scene):
 
 
 def test_a_lane_that_has_seen_enough_goes_no_further():
-    """Of a crowd that all are near, each lane counts as many as it wants."""
+    """Of a crowd in three columns each lane counts as many as it wants."""
     dr = use_drjit()
-    t, points = dr.llvm, np.zeros((50, 3), np.float32)
-    found = lanes.sort_points(points, np.ones(50, bool), 1.0)
+    t, points = dr.llvm, np.zeros((60, 3), np.float32)
+    points[:, 0] = np.repeat([0.0, 1.5, -1.5], 20)
+    found = lanes.sort_points(points, np.ones(60, bool), 1.4)
     table = lanes.table_of(dr, found, [points])
-    wanted = t.UInt32([0, 1, 7, 50, 99])
-    zero = dr.zeros(t.UInt32, 5)
+    wanted = t.UInt32([0, 1, 7, 20, 21, 45, 60, 99])
     (count,) = lane_loops.for_each_around(
         dr,
         table,
-        [dr.zeros(t.Float, 5)] * 3,
+        [dr.zeros(t.Float, 8)] * 3,
         lambda row, count: [count[0] + 1],
-        [zero],
+        [dr.zeros(t.UInt32, 8)],
         lambda count: count[0] < wanted,
     )
-    np.testing.assert_array_equal(count.numpy(), [0, 1, 7, 50, 50])
+    np.testing.assert_array_equal(count.numpy(), [0, 1, 7, 20, 21, 45, 60, 60])
+
+
+@pytest.mark.parametrize("width", [1, 8, 11, 17])
+def test_records_are_read_as_they_were_written(width):
+    """Each lane's to a row of its own; what fills the last packet is 0."""
+    dr, rng = use_drjit(), np.random.default_rng(width)
+    t, rows = dr.llvm, rng.permutation(37).astype(np.uint32)
+    numbers = rng.standard_normal((37, width)).astype(np.float32)
+    left = lanes.blank(dr, 37 * lanes.in_packets(width))
+    left += np.nan
+    given = [t.Float(np.ascontiguousarray(column)) for column in numbers.T]
+    lanes.write_record(dr, left, given, t.UInt32(rows))
+    found = lanes.read_record(dr, left, 37, t.UInt32(rows))
+    np.testing.assert_array_equal(
+        np.stack([a.numpy() for a in found[:width]]).T, numbers
+    )
+    assert all((a.numpy() == 0).all() for a in found[width:])
+    again = lanes.read_record(dr, lanes.records(dr, [numbers]), 37, t.UInt32(rows))
+    np.testing.assert_array_equal(
+        np.stack([a.numpy() for a in again[:width]]).T, numbers[rows]
+    )
+
+
+@given(st.data())
+def test_rows_keep_their_bits(data):
+    """Lots and names are among floats: any of their patterns, not a number or not."""
+    words = st.integers(0, 2**32 - 1)
+    shape = data.draw(st.integers(1, 9)), data.draw(st.integers(1, 10))
+    bits = data.draw(hnp.arrays(np.uint32, shape, elements=words))
+    rows = np.array(data.draw(st.lists(st.integers(0, len(bits) - 1), min_size=1)))
+    for packet in (4, 8):
+        found = lanes.side_by_side([bits.view(np.float32)], rows, packet)
+        assert found.ctypes.data % 64 == 0
+        assert found.shape[1] == lanes.in_packets(shape[1], packet)
+        found = found.view(np.uint32)
+        np.testing.assert_array_equal(found[:, : shape[1]], bits[rows])
+        assert (found[:, shape[1] :] == 0).all()
+    found = cells.rows_of(bits.view(np.float32), rows)
+    assert found.ctypes.data % 64 == 0
+    np.testing.assert_array_equal(found.view(np.uint32), bits[rows])
 
 
 @pytest.mark.parametrize("noted", [1, 2, 5])
