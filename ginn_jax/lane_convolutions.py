@@ -1,10 +1,9 @@
 """The convolutions of f_3D in lanes, one after the other, with the layers between.
 
-What one leaves is in Dr.Jit's memory for the next. While one sums, NumPy sorts points
-for others. Only disks and areas of a new level and large layers between wait for it.
+What one leaves is in Dr.Jit's memory for the next. Nothing waits for a result, but for
+large layers between: while one sums, NumPy readies the points of the next.
 """
 
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -53,17 +52,15 @@ MOST_SUMS = 96
 Numbers = Float[np.ndarray, "_ _ _"] | None
 
 
-class Level(NamedTuple):
+class SortedLevel(NamedTuple):
     """Points of a level, ready to be summed.
 
-    rows    which of the cloud's they are
     points  position and normal
     lanes   the same of each in a lane
     area    that they stand for; none where no convolution weighs them
     tables  points sorted, by the name of the convolution
     """
 
-    rows: Int[np.ndarray, "_"]
     points: Oriented
     lanes: Lanes
     area: Any
@@ -80,29 +77,25 @@ def convolve(
     dr: Any,
     network: Network,
     weights: Any,
-    finest: Level,
-    coarser: Iterator[Level],
+    levels: list[SortedLevel],
     material: Numbers,
     light: Numbers,
-) -> tuple[Code, list[Level]]:
-    """The codes of the finest points, of every channel, and all levels; each is made
-    when it is asked for. `weights`: those of f_3D."""
+) -> Code:
+    """The codes of the finest points, of every channel; `weights`: those of f_3D."""
     weights, channels = jax.device_get(weights), 1 if light is None else len(light)
-    parts = [_enter(dr, network, finest.points.normal, material, light)]
+    parts = [_enter(dr, network, levels[0].points.normal, material, light)]
     done: dict[str, Parts] = {}
-    levels, (*widths, last) = [finest], feature_widths(network)
+    *widths, last = feature_widths(network)
     for conv, width in zip(network.encoder, widths, strict=True):
-        while len(levels) <= max(conv.source, conv.target):
-            levels.append(next(coarser))
         ends = levels[conv.source], levels[conv.target]
         given = dr, network, conv, width, weights, *ends, parts, channels
         before = done[conv.skip] if conv.skip else []
         parts = done[conv.name] = [*before, _convolution(*given)]
-    count = len(finest.rows)
+    count = len(levels[0].points.mask)
     own = records(dr, [light]) if light is not None and network.local else None
     rows = np.arange(channels * count).reshape(channels, count)
     codes = _layers(dr, network, None, last, weights, parts, own, rows).numpy()
-    return as_code(last, codes.reshape(channels, count, -1)), [*levels, *coarser]
+    return as_code(last, codes.reshape(channels, count, -1))
 
 
 def _convolution(
@@ -111,8 +104,8 @@ def _convolution(
     conv: Conv,
     width: Width,
     weights: Any,
-    senders: Level,
-    receivers: Level,
+    senders: SortedLevel,
+    receivers: SortedLevel,
     parts: Parts,
     channels: int,
 ) -> Part:

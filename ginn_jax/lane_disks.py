@@ -4,7 +4,7 @@ What becomes of a sample depends on those thrown before it alone. So the first q
 is decided by itself, among fewer, and of the rest most are dropped by those it kept.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,10 +61,9 @@ def levels_in_lanes(
     normal: Float[np.ndarray, "N 3"],
     lots: Sequence[UInt32[Any, "R"]],
     kept_before: Bool[np.ndarray, "L R"] | None,
-) -> Iterator[Int[np.ndarray, "_"]]:
-    """The samples that each level keeps, finest first, neighbours together: chosen when
-    they are asked for, so that a level can be used while NumPy sorts for the next."""
-    rows = np.arange(len(position))
+) -> list[Int[np.ndarray, "_"]]:
+    """The samples that each level keeps, finest first, neighbours together."""
+    levels, rows = [], np.arange(len(position))
     moved = kept_before is not None
     for i, radius in enumerate(network.levels):
         before = None if kept_before is None else kept_before[i, rows]
@@ -72,7 +71,8 @@ def levels_in_lanes(
         ends = position.take(rows, 0), normal.take(rows, 0), lot, rows
         disk = Disk(radius, network.sided, moved)
         rows = rows[sample_disk_in_lanes(dr, disk, *ends)]
-        yield rows
+        levels.append(rows)
+    return levels
 
 
 def sample_disk_in_lanes(

@@ -4,7 +4,6 @@ The codes are those of `shading.encode` but for rounding. There are no lists of 
 hence no capacities, and no gradient.
 """
 
-import itertools
 from functools import partial
 from typing import Any
 
@@ -16,8 +15,8 @@ from ginn_jax.architecture import Network, reach
 from ginn_jax.facets import Around
 from ginn_jax.hierarchy import draw_lots
 from ginn_jax.lane_convolutions import (
-    Level,
     Numbers,
+    SortedLevel,
     convolve,
 )
 from ginn_jax.lane_disks import levels_in_lanes
@@ -72,25 +71,23 @@ def encode_in_lanes(
     # Drawn in the background, level after level.
     lots = [_lots(bucket(count), i, key) for i in range(len(network.levels))]
     before = None if kept_before is None else np.asarray(kept_before)
-    chosen = levels_in_lanes(dr, network, cloud.position, cloud.normal, lots, before)
+    rows = levels_in_lanes(dr, network, cloud.position, cloud.normal, lots, before)
     # Copied: the caller may write on.
     kept = jax.tree.map(np.array, (cloud, light)) if network.smooth else None
     around = None if kept is None else Around(kept[0], None, kept[1])
-    rows = next(chosen)
-    material, given = (_take(a, rows) for a in (material, light))
+    material, given = (_take(a, rows[0]) for a in (material, light))
     if around is not None:
-        cloud, given = _smooth(dr, network, around, rows, given)
+        cloud, given = _smooth(dr, network, around, rows[0], given)
     scale = None
     if light is not None and given is not None:
         scale = (light[..., 0] / np.float32(count)).sum(axis=1)
         given = given * safe_inverses(scale)[:, None, None]
-    finest = _level(dr, network, cloud, 0, rows)
-    coarser = map(partial(_level, dr, network, cloud), itertools.count(1), chosen)
-    inputs = variables["encoder"]["params"], finest, coarser, material, given
-    (free, beams), levels = convolve(dr, network, *inputs)
+    levels = [_level(dr, network, cloud, i, some) for i, some in enumerate(rows)]
+    weights = variables["encoder"]["params"]
+    free, beams = convolve(dr, network, weights, levels, material, given)
     code = Code(free[0] if scale is None else free, beams)
-    known = finest.points, None, finest.area, code, scale
-    return Encoded(*known, around=around, kept=_named(levels, bucket(count)))
+    known = levels[0].points, None, levels[0].area, code, scale
+    return Encoded(*known, around=around, kept=_named(rows, bucket(count)))
 
 
 @partial(jax.jit, static_argnums=0)
@@ -99,11 +96,11 @@ def _lots(count: int, level: Any, key: Key[Array, ""]) -> Any:
     return draw_lots(count, key=jax.random.fold_in(key, level))
 
 
-def _named(levels: list[Level], count: int) -> Bool[np.ndarray, "L R"]:
+def _named(rows: list[Int[np.ndarray, "_"]], count: int) -> Bool[np.ndarray, "L R"]:
     """Which names are among the rows of each level."""
-    kept = np.zeros((len(levels), count), bool)
-    for among, level in zip(kept, levels, strict=True):
-        among[level.rows] = True
+    kept = np.zeros((len(rows), count), bool)
+    for level, some in zip(kept, rows, strict=True):
+        level[some] = True
     return kept
 
 
@@ -152,7 +149,7 @@ def _smoothed(
 
 def _level(
     dr: Any, network: Network, cloud: Oriented, number: int, rows: Int[np.ndarray, "M"]
-) -> Level:
+) -> SortedLevel:
     """A level of these rows of the cloud, sorted for all that is summed over it."""
     points = Oriented(*(a.take(rows, 0) for a in cloud))
     lanes, area, tables = _ends_of(dr, points), None, {}
@@ -166,4 +163,4 @@ def _level(
         if conv.target == number:
             area = areas(dr, tables[conv.name], *ends, conv.radius, network.sided)
     # To ask for it later would be to wait for all that is under way by then.
-    return Level(rows, points, lanes, None if area is None else area.numpy(), tables)
+    return SortedLevel(points, lanes, None if area is None else area.numpy(), tables)

@@ -151,20 +151,20 @@ def in_packets(count: int, packet: int = PACKET) -> int:
     return -(-count // packet) * packet
 
 
-def read_record(dr: Any, records: Any, count: int, row: Lane) -> Lanes:
+def read_record(dr: Any, table: Any, count: int, row: Lane) -> Lanes:
     """The numbers in one of so many records."""
-    packets, lanes = dr.width(records) // count // PACKET, dr.width(row)
+    packets, lanes = dr.width(table) // count // PACKET, dr.width(row)
     found: Lanes = []
     for packet in range(packets):
         place = row * packets + packet
-        part = dr.gather(dr.llvm.ArrayXf, records, place, shape=(PACKET, lanes))
+        part = dr.gather(dr.llvm.ArrayXf, table, place, shape=(PACKET, lanes))
         found += [part[i] for i in range(PACKET)]
     return found
 
 
-def write_record(dr: Any, blank: Any, numbers: Lanes, row: Lane) -> None:
-    """Numbers of each lane as a record where there is nothing yet. In packets, for a
-    number by itself takes a jump for each lane."""
+def write_record(dr: Any, left: Any, numbers: Lanes, row: Lane) -> None:
+    """Numbers of each lane as a record of `left`, where there is nothing yet. In
+    packets, for a number by itself takes a jump for each lane."""
     zero = dr.zeros(dr.llvm.Float, dr.width(row))
     numbers = numbers + [zero] * (-len(numbers) % PACKET)
     packets = len(numbers) // PACKET
@@ -172,4 +172,4 @@ def write_record(dr: Any, blank: Any, numbers: Lanes, row: Lane) -> None:
         part = dr.llvm.ArrayXf(numbers[packet * PACKET : (packet + 1) * PACKET])
         place = row * packets + packet
         # All at once: one after the other they would be as many programs.
-        dr.scatter(blank, part, place, mode=dr.ReduceMode.Permute)
+        dr.scatter(left, part, place, mode=dr.ReduceMode.Permute)
