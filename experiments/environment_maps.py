@@ -28,14 +28,17 @@ from ginn_jax.lighting import (
 )
 from ginn_jax.lit_clouds import mean_light
 from ginn_jax.lit_scenes import Scattering, light_mesh, lit_points
-from ginn_jax.mesh import add_ground, fit_unit_box, load_mesh
 from ginn_jax.metrics import foreground, tone_map
-from ginn_jax.objects import UNSEEN_SEED, random_point_light, tell_apart
+from ginn_jax.objects import (
+    UNSEEN_SEED,
+    object_or_shape,
+    random_point_light,
+    tell_apart,
+)
 from ginn_jax.pairing import spread
 from ginn_jax.pretrained import load_network
 from ginn_jax.reference import build_scene
 from ginn_jax.relight import Relightable, prepare_relighting, relight
-from ginn_jax.shapes import random_shape
 from ginn_jax.visible import visible_samples
 
 
@@ -85,10 +88,7 @@ def main(options: Options) -> dict[str, Any]:
     assert not isinstance(settings, compare.Occlusion)
     unseen = UNSEEN_SEED + options.seed
     scatters = isinstance(settings, Scattering)
-    mesh = fit_unit_box(
-        load_mesh(options.mesh) if options.mesh else random_shape(unseen, scatters)
-    )
-    mesh = mesh if scatters else add_ground(mesh)
+    mesh = object_or_shape(options.mesh, unseen, not scatters)
     scene = build_scene(mesh)
     samples = visible_samples(scene, settings.points, options.seed, not scatters)
     config, limits, weights = load_network(options.effect, options.checkpoint)

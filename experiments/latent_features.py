@@ -23,12 +23,11 @@ from ginn_jax.commandline import require, start
 from ginn_jax.lighting import procedural_environment
 from ginn_jax.lit_clouds import network_numbers
 from ginn_jax.lit_scenes import light_mesh, lit_points
-from ginn_jax.mesh import Mesh, add_ground, fit_unit_box, load_mesh
-from ginn_jax.objects import UNSEEN_SEED
+from ginn_jax.mesh import Mesh
+from ginn_jax.objects import UNSEEN_SEED, object_or_shape
 from ginn_jax.pretrained import load_network
 from ginn_jax.reference import GBuffer, build_scene, render_gbuffer
 from ginn_jax.scenes import Occlusion
-from ginn_jax.shapes import random_shape
 from ginn_jax.visible import visible_samples
 
 AZIMUTHS = (35.0, 155.0)
@@ -66,12 +65,7 @@ def main(options: Options) -> Path:
     """Draw the figure; returns its path."""
     require(options, {"channels": 1, "resolution": 32, "points": 1000, "seed": 0})
     unseen = UNSEEN_SEED + options.seed
-    mesh = fit_unit_box(
-        load_mesh(options.mesh)
-        if options.mesh
-        else random_shape(unseen, options.effect == "sss")
-    )
-    mesh = mesh if options.effect == "sss" else add_ground(mesh)
+    mesh = object_or_shape(options.mesh, unseen, options.effect != "sss")
     position, code = latent_code(options, mesh)
     panels = np.concatenate([principal(code), ranked(code[:, : options.channels])], 1)
     scene, size = build_scene(mesh), options.resolution

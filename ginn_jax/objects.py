@@ -40,7 +40,8 @@ class LightSource:
 
 @dataclass(frozen=True)
 class Source:
-    """One object: a mesh file, or the seed of a procedural shape; and its light."""
+    """One object, a mesh file or else the procedural shape of its name, as "shape_7";
+    and its light. The seed is that of materials, samples and paths."""
 
     name: str
     path: str | None
@@ -103,24 +104,34 @@ def file_lights(paths: Sequence[Path]) -> list[LightSource]:
     ]
 
 
-def load_object(source: Source, ground: bool = True) -> Mesh:
-    """The object in its unit box, on the ground if there is one.
+def object_or_shape(path: Path | None, seed: int, ground: bool) -> Mesh:
+    """The object of a file, or else the procedural shape of that seed, in its unit box,
+    on the ground if there is one.
 
     Without ground it is there for its medium, which only a closed shape can hold.
     """
-    if source.path is None:
-        mesh = random_shape(shape_seed(source), closed=not ground)
-    else:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", InputWarning)
-            mesh = load_mesh(source.path)
+    mesh = load_mesh(path) if path else random_shape(seed, closed=not ground)
     mesh = fit_unit_box(mesh)
     return add_ground(mesh) if ground else mesh
 
 
+def load_object(source: Source, ground: bool = True) -> Mesh:
+    """`object_or_shape` of a source, without the warnings of files."""
+    if source.path is None:
+        return object_or_shape(None, shape_seed(source), ground)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        return object_or_shape(Path(source.path), 0, ground)
+
+
 def shape_seed(source: Source) -> int:
     """The seed of a procedural shape, which its name keeps under any light."""
-    return int(source.name.split("__")[0].removeprefix("shape_"))
+    number = source.name.split("__")[0].removeprefix("shape_")
+    if not number.isdecimal():
+        raise InputError(
+            f'{source.name} names no shape: call it "shape_7", or give a path'
+        )
+    return int(number)
 
 
 def load_light(source: Source) -> Light:

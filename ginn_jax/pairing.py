@@ -74,9 +74,9 @@ def pair_up(
         for k in range(each):
             light = lights[(i * each + k) % len(lights)]
             name = f"{source.name}__{light.name}"
-            seed = source.seed * each + k
-            if source.path is not None:
-                seed = zlib.crc32(name.encode())
+            # Materials and paths of its own, whatever else is paired.
+            own = source.path is None and each == 1
+            seed = source.seed if own else zlib.crc32(name.encode())
             pairs.append(replace(source, name=name, light=light, seed=seed))
     return pairs
 

@@ -12,6 +12,7 @@ from strategies import SEEDS
 from ginn_jax.errors import InputError
 from ginn_jax.mesh import find_meshes
 from ginn_jax.objects import (
+    Source,
     file_sources,
     load_object,
     point_lights,
@@ -195,6 +196,23 @@ def test_shape_has_its_seed_under_any_light(seed, each):
     pairs = pair_up([alone], procedural_lights(5, 7), each)
     assert shape_seed(alone) == seed
     assert {shape_seed(p) for p in pairs} == {seed}
+
+
+@given(st.integers(0, 99), st.integers(1, 9), st.integers(1, 9))
+def test_other_objects_get_other_seeds_whatever_the_number_of_lights(first, one, other):
+    """Their materials are drawn by them: none is trained and tested on."""
+    things, lights = procedural_sources(60, first), procedural_lights(9, 0)
+    seen, unseen = (
+        pair_up(things[:30], lights, one),
+        pair_up(things[30:], lights, other),
+    )
+    assert not {p.seed for p in seen} & {p.seed for p in unseen}
+
+
+@pytest.mark.parametrize("name", ["chair", "shape_x", "shape_-1", ""])
+def test_a_name_that_is_no_shapes_is_refused(name):
+    with pytest.raises(InputError, match=r"names no shape: call it .* or give a path"):
+        load_object(Source(name, None, 7))
 
 
 def test_procedural_object_keeps_its_shape_under_any_light():
