@@ -5,6 +5,7 @@ import io
 import logging
 import os
 import re
+import shlex
 import sys
 import threading
 import traceback
@@ -54,14 +55,14 @@ def start(
 
 def command_line(module: str, options: Any) -> str:
     """The command that runs a script with these options, but for where it writes."""
-    words, usual = [f"python -m {module}"], type(options)()
+    words, usual = ["python", "-m", module], type(options)()
     for field in fields(options):
         value = getattr(options, field.name)
         if field.name != "out" and value != getattr(usual, field.name):
             given = value if isinstance(value, tuple | list) else (value,)
             words += [f"--{field.name.replace('_', '-')}"]
             words += [] if value is True else map(str, given)
-    return " ".join(words)
+    return shlex.join(words)
 
 
 def silence_threads() -> None:

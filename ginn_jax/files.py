@@ -1,13 +1,27 @@
 """Files as they come and go: checked before they are read, written whole or not."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ginn_jax.errors import InputError
 
 HEAD = 4096
+
+
+def files_below(folder: Path, endings: Container[str]) -> list[Path]:
+    """The files there and in all folders below that end so, in any case, sorted.
+
+    Hidden ones are left out: they are notes of the system's.
+    """
+    return sorted(
+        path
+        for path in folder.rglob("*")
+        if path.suffix.lower() in endings
+        and not path.name.startswith(".")
+        and path.is_file()
+    )
 
 
 def check_file(path: Path, wanted: str) -> None:

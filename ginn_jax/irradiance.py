@@ -50,7 +50,7 @@ def light_scene(mesh: Mesh, albedo: Float[np.ndarray, "K 3"], light: Light) -> L
     Raises `InputError` for an albedo outside [0, 1] or a material without one, and for
     a mesh or a light that no renderer can take.
     """
-    check_mesh(mesh)
+    mesh = check_mesh(mesh)
     check_light(light)
     albedo = real_array("albedo", albedo).astype(np.float64)
     if albedo.ndim != 2 or albedo.shape[1] != 3 or not (albedo >= 0).all():
@@ -81,7 +81,10 @@ def emitter(light: Light) -> dict[str, Any]:
     """The light as a Mitsuba dictionary; call it with the variant set."""
     mi, _ = use_mitsuba()
     if isinstance(light, EnvironmentMap):
-        return {"type": "envmap", "bitmap": mi.Bitmap(light.radiance)}
+        radiance = light.radiance
+        if radiance.shape[0] < 3 or radiance.shape[1] < 2:  # Mitsuba takes no smaller
+            radiance = radiance.repeat(3, axis=0).repeat(2, axis=1)
+        return {"type": "envmap", "bitmap": mi.Bitmap(radiance)}
     return {
         "type": "point",
         "position": [float(x) for x in light.position],

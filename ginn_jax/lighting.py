@@ -14,7 +14,7 @@ from jaxtyping import Float
 from ginn_jax import radiance_files
 from ginn_jax.checks import LARGEST, LARGEST_SEED, number, real_array, vector, whole
 from ginn_jax.errors import InputError
-from ginn_jax.files import check_file
+from ginn_jax.files import check_file, files_below
 from ginn_jax.renderer import use_mitsuba
 
 ENDINGS = (".hdr", ".exr", ".pfm")
@@ -49,7 +49,7 @@ def find_environments(path: str | Path) -> list[Path]:
         raise InputError(f"{path}: no such file or folder; give environment maps")
     if path.is_file():
         return [path]
-    found = sorted(p for p in path.rglob("*") if p.suffix.lower() in ENDINGS)
+    found = files_below(path, ENDINGS)
     if not found:
         raise InputError(f"{path}: no {', '.join(ENDINGS)} in this folder")
     return found

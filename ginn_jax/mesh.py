@@ -15,6 +15,7 @@ from trimesh.exchange.load import mesh_formats
 from ginn_jax import orientation
 from ginn_jax.checks import positive, real_array
 from ginn_jax.errors import InputError, InputWarning, naming
+from ginn_jax.files import files_below
 from ginn_jax.mesh_files import load_scene, merge
 
 GROUND_GAP = 1e-4
@@ -87,13 +88,9 @@ def find_meshes(path: str | Path) -> list[Path]:
         raise InputError(f"{path}: no such file or folder; give one with meshes")
     if path.is_file():
         return [path]
-    # Of .xyz none has triangles, and hidden files are notes of the system's.
+    # Of .xyz none has triangles.
     endings = {f".{name}" for name in mesh_formats()} - {".xyz"}
-    found = sorted(
-        p
-        for p in path.rglob("*")
-        if p.suffix.lower() in endings and not p.name.startswith(".")
-    )
+    found = files_below(path, endings)
     if not found:
         raise InputError(f"{path}: no mesh in this folder; put .ply, .obj, .glb there")
     return found
@@ -126,17 +123,19 @@ def add_ground(mesh: Mesh, half_extent: float = 0.8) -> Mesh:
     )
 
 
-def check_mesh(mesh: Mesh) -> None:
-    """Raise `InputError` unless these are triangles with an area, each of a material.
+def check_mesh(mesh: Mesh) -> Mesh:
+    """The mesh in NumPy's arrays of the types that all else expects.
 
-    `make_mesh` makes only such; a `Mesh` put together by hand may be anything.
+    `make_mesh` makes only such; a `Mesh` put together by hand may be anything. Raises
+    `InputError` unless these are triangles with an area, each of a material.
     """
     if not isinstance(mesh, Mesh):
         kind = type(mesh).__name__
         raise InputError(f"mesh is a {kind}: give what load_mesh or make_mesh returns")
-    vertices, faces, _ = _checked_arrays(*mesh)
+    vertices, faces, material = _checked_arrays(*mesh)
     if not area_vectors(vertices[faces].astype(np.float64)).any():
         raise InputError("mesh: all faces have zero area; give triangles with an area")
+    return Mesh(vertices, faces.astype(np.int32), material)
 
 
 def _checked_arrays(vertices, faces, material):
@@ -161,12 +160,14 @@ def _checked_arrays(vertices, faces, material):
         raise InputError(
             f"mesh: a face index is outside 0..{len(vertices) - 1}; mend it"
         )
-    material = np.zeros(len(faces)) if material is None else material
+    material = np.zeros(len(faces), np.int32) if material is None else material
     material = real_array("material", material)
     if material.shape != (len(faces),):
         raise InputError(f"mesh: give one material a face, {len(faces)} in all")
     if not ((material >= 0) & (material <= LAST_MATERIAL)).all():
         raise InputError(f"mesh: a material is outside 0..{LAST_MATERIAL}; mend it")
+    if (material % 1 != 0).any():
+        raise InputError("mesh: a material is no whole number; mend it")
     return vertices, faces, material.astype(np.int32)
 
 

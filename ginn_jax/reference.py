@@ -95,15 +95,13 @@ def build_scene(mesh: Mesh) -> Scene:
     Raises `InputError` for an empty or non-finite mesh, a face that names a vertex
     that is not there, or a machine without a usable libLLVM.
     """
-    check_mesh(mesh)
-    vertices = np.ascontiguousarray(mesh.vertices, np.float32)
-    faces = np.asarray(mesh.faces)
+    mesh = check_mesh(mesh)
     mi, variant = use_mitsuba()
     with mi.variant_context(variant):
-        shape = mi.Mesh("mesh", len(vertices), len(faces))
+        shape = mi.Mesh("mesh", len(mesh.vertices), len(mesh.faces))
         params = mi.traverse(shape)
-        params["vertex_positions"] = vertices.ravel()
-        params["faces"] = np.ascontiguousarray(faces, np.uint32).ravel()
+        params["vertex_positions"] = mesh.vertices.ravel()
+        params["faces"] = mesh.faces.astype(np.uint32).ravel()
         params.update()
         return Scene(mesh, mi.load_dict({"type": "scene", "mesh": shape}))
 

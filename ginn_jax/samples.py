@@ -70,7 +70,7 @@ def sample_surface(mesh: Mesh, count: int, *, seed: int) -> Samples:
     """`count` points uniform by area, with the normals and materials of their faces."""
     whole("count", count, 0, LARGEST_INDEX)
     whole("seed", seed, 0, 2**63 - 1)
-    check_mesh(mesh)
+    mesh = check_mesh(mesh)
     shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     position, face = trimesh.sample.sample_surface(shape, count, seed=seed)[:2]
     normal = area_vectors(mesh.vertices[mesh.faces[face]].astype(np.float64))

@@ -12,6 +12,7 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 
 from ginn_jax.errors import InputError
+from ginn_jax.files import files_below
 from ginn_jax.mesh import Mesh, add_ground, fit_unit_box, near_origin
 from ginn_jax.orientation import turn_outward
 from ginn_jax.reference import build_scene
@@ -38,13 +39,14 @@ class Carried(NamedTuple):
 
 
 def find_animations(path: Path) -> list[Path]:
-    """The .npz files of a folder, sorted; or the one file, which need not exist.
+    """The .npz files of a folder and those below it, sorted; or the one file, which
+    need not exist.
 
     Raises `InputError` where there is none in the folder.
     """
     if not path.is_dir():
         return [path]
-    found = sorted(path.glob("*.npz"))
+    found = files_below(path, {".npz"})
     if not found:
         raise InputError(f"{path}: no animation in this folder; put .npz files there")
     return found
@@ -162,14 +164,15 @@ def samples_at(mesh: Mesh, carried: Carried) -> Samples:
 
 
 def flicker(
-    images: Float[np.ndarray, "T P *C"],
-    reference: Float[np.ndarray, "T P *C"],
-    variance: Float[np.ndarray, "T P *C"],
-    seen: Float[np.ndarray, "T P"] | np.ndarray,
+    images: Float[np.ndarray, "T *A"],
+    reference: Float[np.ndarray, "T *A"],
+    variance: Float[np.ndarray, "T *A"],
+    seen: Bool[np.ndarray, "T *S"],
 ) -> float:
     """Mean squared frame-to-frame change that the reference does not have.
 
-    Over pixels seen in both frames; the noise of the reference is subtracted.
+    Over the pixels [T *S] that are seen in both frames; the noise of the reference is
+    subtracted.
     """
     change = np.diff(images.astype(np.float64), axis=0)
     right = np.diff(reference.astype(np.float64), axis=0)

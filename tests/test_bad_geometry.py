@@ -94,6 +94,7 @@ TABLE: Table = {
         ((RAGGED, [[0, 1, 2]]), "vertices has rows of unequal length"),
         ((np.eye(3), [[0, 1, 2]], [-1]), r"a material is outside 0..255; mend"),
         ((np.eye(3), [[0, 1, 2]], [NAN]), r"a material is outside 0..255; mend"),
+        ((np.eye(3), [[0, 1, 2]], [0.7]), "a material is no whole number; mend"),
         ((np.eye(3), [[0, 1, 2]], ["red"]), "material holds <U3"),
     ],
     mesh.fit_unit_box: [

@@ -41,6 +41,15 @@ def test_open_plane_under_a_constant_sky():
     np.testing.assert_allclose(under, 2 * np.pi, rtol=0.01)
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (1, 2), (2, 2), (2, 9), (9, 1), (3, 2)])
+def test_a_map_of_few_pixels_is_light_as_any_other(shape):
+    sky = EnvironmentMap(np.full((*shape, 3), 2, np.float32))
+    points, normals = sampled(floor(), 50)
+    scene = light_scene(floor(), WHITE, sky)
+    found = direct_irradiance(scene, points, normals, samples=1024, seed=0)
+    np.testing.assert_allclose(found, 2 * np.pi, rtol=0.02)
+
+
 def quadrature(light, normal, fine=4):
     """Irradiance of a map whose first and last row lie on the poles, as Mitsuba's do.
 

@@ -110,8 +110,9 @@ def test_any_size_is_averaged_to_at_most_the_height(height, width, data):
 def test_maps_are_found_in_folders_below(tmp_path):
     (tmp_path / "more" / "still").mkdir(parents=True)
     names = ["b.hdr", "a.EXR", "more/c.pfm", "more/still/a.hdr", "d.txt", "hdr"]
-    for name in names:
+    for name in (*names, "._b.hdr"):
         (tmp_path / name).touch()
+    (tmp_path / "folder.hdr").mkdir()
     found = find_environments(tmp_path)
     assert found == sorted(tmp_path / name for name in names[:4])
     assert find_environments(tmp_path / "d.txt") == [tmp_path / "d.txt"]

@@ -68,3 +68,18 @@ def test_ground_faces_up_just_below_the_lowest_vertex(half_extent, lowest):
     assert (normal[:, 1] > 0).all()
     assert heron(corners).sum() == pytest.approx(4 * half_extent**2, rel=1e-4)
     np.testing.assert_allclose(np.abs(corners[..., [0, 2]]), half_extent, rtol=1e-6)
+
+
+def test_a_mesh_made_by_hand_becomes_arrays():
+    vertices, faces = cube()
+    by_hand = gm.Mesh(
+        np.asarray(vertices).tolist(), np.asarray(faces, np.uint8), np.zeros(12)
+    )
+    mesh = gm.check_mesh(by_hand)
+    assert mesh.vertices.dtype == np.float32
+    assert mesh.faces.dtype == mesh.material.dtype == np.int32
+    made = gm.make_mesh(vertices, faces)
+    for found, expected in zip(mesh, made, strict=True):
+        np.testing.assert_array_equal(found, expected)
+    seen = [gs.sample_surface(m, 50, seed=0).position for m in (by_hand, made)]
+    np.testing.assert_array_equal(*seen)

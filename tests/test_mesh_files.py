@@ -78,6 +78,7 @@ def test_notes_of_the_system_and_points_are_no_meshes(tmp_path):
     box.export(tmp_path / "box.ply")
     (tmp_path / "._box.ply").write_bytes(b"notes")
     (tmp_path / "scan.xyz").write_text("0 0 0\n")
+    (tmp_path / "folder.obj").mkdir()
     assert gm.find_meshes(tmp_path) == [tmp_path / "box.ply"]
 
 

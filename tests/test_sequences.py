@@ -174,9 +174,10 @@ def test_what_is_no_animation_is_refused(tmp_path):
 def test_a_folder_stands_for_its_animations_sorted(tmp_path):
     with pytest.raises(InputError, match="no animation in this folder"):
         sequences.find_animations(tmp_path)
-    for name in ("b.npz", "a.npz", "notes.txt"):
+    (tmp_path / "sub").mkdir()
+    for name in ("b.npz", "a.npz", "sub/c.npz", "notes.txt", "._a.npz"):
         (tmp_path / name).touch()
     found = sequences.find_animations(tmp_path)
-    assert [path.name for path in found] == ["a.npz", "b.npz"]
-    missing = tmp_path / "c.npz"
+    assert [path.name for path in found] == ["a.npz", "b.npz", "c.npz"]
+    missing = tmp_path / "d.npz"
     assert sequences.find_animations(missing) == [missing]
