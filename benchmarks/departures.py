@@ -80,6 +80,14 @@ class Unseen(NamedTuple):
     clouds: Sequence[ShadedPoints]
 
 
+class Data(NamedTuple):
+    """What all learn from, as runs record it, its clouds, and unseen objects."""
+
+    learned: dict[str, Any]
+    clouds: Sequence[ShadedPoints]
+    tests: dict[str, Unseen]
+
+
 def variants(network: Network) -> dict[str, Network]:
     """Ours, the same for other weights, and what lacks one departure or all."""
     lacking = {f"without {n}": replace(network, **c) for n, c in WITHOUT.items()}
@@ -103,12 +111,13 @@ def compare(
     options: Options,
     run: experiment.RunOptions,
     network: Network,
-    clouds: Sequence[ShadedPoints],
-    tests: dict[str, Unseen],
+    data: Data,
 ) -> dict[str, Any]:
     """Errors and times of one network after its training."""
+    _, clouds, tests = data
     config = experiment.training(run, network, options.points, len(clouds))
-    done = experiment.train(console, config, clouds, run, {}, experiment.Clock())
+    given = config, clouds, run, data.learned, experiment.Clock()
+    done = experiment.train(console, *given)
     variables = jax.device_put(done.state.variables, jax.devices()[0])
     model = evaluate.Model(variables, jax.random.key(options.seed))
     row: dict[str, Any] = {"skipped": int(done.state.skipped)}
@@ -136,9 +145,7 @@ def image_times(
     return {f"{part}_ms": 1e3 * found[f"seconds_{part}"] for part in ("3d", "2d")}
 
 
-def make_clouds(
-    console: Console, options: Options
-) -> tuple[Sequence[ShadedPoints], dict[str, Unseen]]:
+def make_clouds(console: Console, options: Options) -> Data:
     """Clouds to train on and unseen ones."""
     settings = scenes.Occlusion(options.points, options.rays)
     exact = scenes.Occlusion(options.points, EXACT_RAYS)
@@ -150,10 +157,11 @@ def make_clouds(
         kinds["meshes"] = objects.file_sources(find_meshes(options.test_meshes))
     folder = options.out / "data"
     clouds = experiment.make(console, "training", seen, settings, folder / "training")
-    return clouds, {
+    tests = {
         name: Unseen(some, experiment.make(console, name, some, exact, folder / name))
         for name, some in kinds.items()
     }
+    return Data(experiment.learned(settings, seen), clouds, tests)
 
 
 def main(options: Options) -> dict[str, Any]:
@@ -161,12 +169,12 @@ def main(options: Options) -> dict[str, Any]:
     least = {"steps": 1, "shapes": 1, "test_shapes": 1, "points": 1000, "rays": 2}
     require(options, least | {"resolution": 32, "seed": 0})
     console, begin = Console(), time.perf_counter()
-    clouds, tests = make_clouds(console, options)
+    data = make_clouds(console, options)
     rows, metrics = list[dict[str, Any]](), dict[str, Any]()
     for name, network in variants(DEFAULT).items():
         console.print(name)
         run = run_of(options, name)
-        found = compare(console, options, run, network, clouds, tests)
+        found = compare(console, options, run, network, data)
         rows.append({"network": name} | found)
         # After each, so that what was measured is not lost with what was not.
         metrics = {"rows": rows} | circumstances(options, begin)

@@ -24,6 +24,7 @@ from ginn_jax import block_shading, blocks, image, inference, objects, reference
 from ginn_jax.architecture import Network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, require_positive, require_some, start
+from ginn_jax.errors import InputError
 from ginn_jax.evaluate import at_scale
 from ginn_jax.limits import Limits, only
 from ginn_jax.mesh import find_meshes
@@ -207,6 +208,11 @@ def main(options: Options) -> dict[str, Any]:
     require(options, least)
     require_positive(options, "disks", "radii")
     require_some(options, "disks")
+    if len(options.disks) != len(options.radii):
+        raise InputError(
+            f"--disks are {len(options.disks)}, --radii {len(options.radii)}: give as "
+            "many"
+        )
     begin = time.perf_counter()
     scene, gbuffer = make_frame(options)
     pairs = zip(options.disks, options.radii, strict=True)

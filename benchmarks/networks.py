@@ -11,7 +11,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -73,6 +73,14 @@ QUICK |= {"resolution": 48}
 Scenes = dict[str, tuple[Sequence[Source], Sequence[LitCloud]]]
 
 
+class Data(NamedTuple):
+    """What all learn from, as runs record it, its clouds, and unseen scenes."""
+
+    learned: dict[str, Any]
+    clouds: Sequence[LitCloud]
+    tests: Scenes
+
+
 def main(options: Options) -> dict[str, Any]:
     """Train and evaluate every preset; returns what metrics.json holds."""
     require_positive(options, "seconds")
@@ -92,11 +100,11 @@ def main(options: Options) -> dict[str, Any]:
         for name, some in unseen.items()
     }
     table = ILLUMINATION if options.effect == "gi" else SCATTERING
-    rows = []
+    data, rows = Data(experiment.learned(settings, seen), clouds, tests), []
     for preset in options.presets:
         console.print(preset)
         own = replace(run, out=options.out / preset)
-        found = compare(console, options, own, table[preset], clouds, tests, exact)
+        found = compare(console, options, own, table[preset], data, exact)
         rows.append({"preset": preset} | found)
     metrics = {"rows": rows} | circumstances(options, begin)
     text = write_report(options, rows)
@@ -110,16 +118,17 @@ def compare(
     options: Options,
     run: LitOptions,
     network: Network,
-    clouds: Sequence[LitCloud],
-    tests: Scenes,
+    data: Data,
     settings: LitSettings,
 ) -> dict[str, Any]:
     """Steps, errors and times of one network after its time of training."""
+    _, clouds, tests = data
     config = experiment.training(run, network, run.points, len(clouds))
     steps = max(round(options.seconds / step_seconds(config, clouds)), 1)
     forget_programs()
     config, run = replace(config, steps=steps), replace(run, steps=steps)
-    done = experiment.train(console, config, clouds, run, {}, experiment.Clock())
+    ends = config, clouds, run, data.learned, experiment.Clock()
+    done = experiment.train(console, *ends)
     variables = jax.device_put(done.state.variables, jax.devices()[0])
     model = Model(variables, jax.random.key(run.seed))
     made = {"steps": steps, "seconds": done.seconds["train"]}

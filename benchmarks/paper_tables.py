@@ -16,6 +16,7 @@ from rich.console import Console
 from ginn_jax import report
 from ginn_jax.commandline import start
 from ginn_jax.errors import InputError
+from ginn_jax.run_record import damaged
 
 EFFECTS = ("ao", "gi", "sss")
 METHODS = ("screen space", "2D only", "3D only", "ours")
@@ -62,32 +63,40 @@ class Options:
 def main(options: Options) -> dict[str, Any]:
     """Write the tables; returns what metrics.json holds."""
     found = {effect: load(options.evaluations, effect) for effect in EFFECTS}
-    rows = [
-        row_of(effect, method, found[effect])
-        for effect in EFFECTS
-        for method in METHODS
-    ]
-    lost = {effect: found[effect]["lost_cells"] for effect in EFFECTS}
-    made = {e: (m["options"], m["environment"]) for e, m in found.items()}
-    metrics = {"rows": rows, "lost_cells": lost} | {
-        "resolution": {e: options["resolution"] for e, (options, _) in made.items()},
-        "processor": {e: env["processor"] for e, (_, env) in made.items()},
-    }
+    metrics: dict[str, Any] = {"rows": []}
+    metrics |= {name: {} for name in ("lost_cells", "resolution", "processor")}
+    for effect, measured in found.items():
+        with damaged(measured_at(options.evaluations, effect), "evaluate again"):
+            metrics["rows"] += [row_of(effect, name, measured) for name in METHODS]
+            metrics["lost_cells"][effect] = measured["lost_cells"]
+            metrics["resolution"][effect] = measured["options"]["resolution"]
+            metrics["processor"][effect] = measured["environment"]["processor"]
     report.write_results(options.out, metrics, write_report(metrics))
     Console().print(f"{options.out / 'report.md'}")
     return metrics
 
 
+def measured_at(folder: Path, effect: str) -> Path:
+    """Where what was measured of an effect is."""
+    return folder / f"evaluate_{effect}" / "metrics.json"
+
+
 def load(folder: Path, effect: str) -> dict[str, Any]:
     """What was measured of an effect."""
-    path = folder / f"evaluate_{effect}" / "metrics.json"
+    path = measured_at(folder, effect)
+    again = (
+        f"run python -m experiments.evaluate --effect {effect} --out {path.parent} "
+        "first"
+    )
     try:
-        return json.loads(path.read_text())
+        found = json.loads(path.read_text())
     except (OSError, ValueError):
-        raise InputError(
-            f"{path} cannot be read: run python -m experiments.evaluate --effect "
-            f"{effect} --out {path.parent} first"
-        ) from None
+        raise InputError(f"{path} cannot be read: {again}") from None
+    with damaged(path, again):
+        other = found["options"]["effect"]
+    if other != effect:
+        raise InputError(f"{path} is of another effect: {again}")
+    return found
 
 
 def row_of(effect: str, method: str, measured: dict[str, Any]) -> dict[str, Any]:

@@ -142,10 +142,11 @@ def main(options: Options) -> dict[str, Any]:
         for name, rows in tables.items()
     }
     metrics = {"tables": records, "slopes": slopes, "peak_memory_gib": peak}
-    report.write_results(options.out, metrics | circumstances(options, begin), text)
+    metrics |= circumstances(options, begin)
+    report.write_results(options.out, metrics, text)
     draw(options.out / "scaling.png", tables)
     print(text)
-    return {"slopes": slopes, "tables": tables}
+    return metrics
 
 
 def write_report(

@@ -8,7 +8,7 @@ shapes that training never saw. `--help` lists every option with its default.
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,6 +26,7 @@ from ginn_jax.experiment import (
     check_run,
     closing,
     errors_by_set,
+    learned,
     make,
     on_disk,
     train,
@@ -95,7 +96,7 @@ def main(options: Options) -> dict[str, Any]:
     clock.lap("data", begin)
 
     config = training(options, network, options.points, len(clouds))
-    extra = {"data": asdict(settings), "objects": [s.name for s in train_sources]}
+    extra = learned(settings, train_sources)
     run = train(console, config, clouds, options, extra, clock)
 
     begin = time.perf_counter()
@@ -150,12 +151,10 @@ def evaluation(
     sets = {"shapes": procedural} | ({"meshes": files} if files else {})
     floor = float(np.mean([np.mean(c.variance) for c in clouds]))
     report.draw_curve(options.out / "learning_curve.png", run.losses, floor)
-    shown = list(zip(sources, unseen, strict=True))[:3]
-    if files:
-        shown = [
-            *shown[:2],
-            *list(zip(sources, unseen, strict=True))[len(procedural) :][:2],
-        ]
+    first, real = range(len(procedural)), range(len(procedural), len(sources))
+    # Of each kind a few, not all at once: the clouds may stay on disk.
+    some = [*first[:2], *real[:2]] if files else first[:3]
+    shown = [(sources[i], unseen[i]) for i in some]
     images = image_evaluation(options, config, limits, model, shown)
     return errors_by_set(sets) | images
 

@@ -137,12 +137,14 @@ def main(options: Options) -> dict[str, Any]:
     warn_of_seen((*named, *options.beside), names)
     key = jax.random.key(options.seed)
     networks = load_networks(options.effect, settings, named, key=key)
+    beside = others_beside(options.effect, settings, options.beside, key=key)
+    disk_variants(networks[OURS], options.disks)  # raises for what is no radius here
     settings = compare.with_looks(settings, options.looks)
     clouds = make(console, "clouds", sources, settings, options.out / "clouds")
     at_points, networks = errors_at_points(networks, clouds, sources, settings)
     networks |= {OURS + of_samples(s): networks[OURS] for s in options.shares}
     networks |= disk_variants(networks[OURS], options.disks)
-    networks |= others_beside(options.effect, settings, options.beside, key=key)
+    networks |= beside
     found = []
     for source, cloud in zip(sources, clouds, strict=True):
         console.print(f"{source.name}")
@@ -187,7 +189,8 @@ def compare_scene(
         more, networks = network_pictures(networks, given, shot)
         pictures += more
         about = {"name": source.name, "view": view, "seconds_sampling": apart}
-        about |= {"noise_dssim": compare.noise_dssim(shot, seed=view)}
+        noise, pixels = compare.noise_dssim(shot, seed=view), shot.gbuffer.mask.sum()
+        about |= {"noise_dssim": noise, "pixels": int(pixels)}
         rows += [p.row | about for p in pictures]
         if view == 0:
             shown = compare.displayed(shot, pictures)

@@ -7,8 +7,7 @@ import numpy as np
 
 from ginn_jax import report
 from ginn_jax.compare_networks import OURS
-from ginn_jax.evaluate import Row
-from ginn_jax.metrics import relative_error
+from ginn_jax.evaluate import Row, mean_rows
 
 TITLES = {"ao": "Ambient occlusion", "gi": "Global illumination"}
 TITLES |= {"sss": "Subsurface scattering"}
@@ -43,20 +42,6 @@ def pareto_front(rows: Sequence[Row], error: str = "mse_2d") -> list[str]:
     return front
 
 
-def pool_shots(rows: Sequence[Row]) -> list[Row]:
-    """Means over the shots of each method; relative errors as ratios of means."""
-    methods: dict[str, list[Row]] = {}
-    for row in rows:
-        methods.setdefault(row["method"], []).append(row)
-    pooled = []
-    for method, group in methods.items():
-        numbers = [k for k, v in group[0].items() if isinstance(v, int | float)]
-        mean = {k: float(np.mean([row[k] for row in group])) for k in numbers}
-        mean["relative_mse_2d"] = relative_error(mean["mse_2d"], mean["variance_2d"])
-        pooled.append({"method": method, "shots": len(group)} | mean)
-    return pooled
-
-
 def summary(
     effect: str,
     at_points: Mapping[str, Row],
@@ -65,13 +50,13 @@ def summary(
     counted_rows: Sequence[Row],
 ) -> dict[str, Any]:
     """What all shots together say of the methods, and the errors at points."""
-    results = pool_shots(rows)
+    results = mean_rows(rows)
     for row in results:
         known = at_points.get(row["method"], {})
         row |= {k: known[k] for k in KEPT if k in known}
-    front = pool_shots(front_rows)
+    front = mean_rows(front_rows)
     fresh = [row for row in front if "kept" not in row]
-    counted = pool_shots(counted_rows)
+    counted = mean_rows(counted_rows)
     traced = [row for row in front if "traced" in row or "denoised" in row]
     ours = next(r for r in results if r["method"] == OURS)
     openness = "Errors are of openness, 1 where nothing is near."
@@ -122,10 +107,16 @@ network was given and that light reaches by one of 32 rays.
 ## The paper's table
 
 {report.table_of(m["results"], cells)}
+Relative errors are MSE over the variance of the reference: to predict its mean has 1.
 Cells that our network loses against screen space of either kind, 2D only or 3D only:
 
 {lost}
 
+## Scene by scene
+
+Relative 2D error over the views of each; "pixels" are in the foreground of one.
+
+{_by_scene(m["rows"])}
 ## Time and memory
 
 Same pixels, same machine, one method after the other, medians of three calls after a
@@ -151,6 +142,16 @@ are kept: {", ".join(m["front_kept"])}.
 
 ![methods on the same pixels](ablation.png)
 """
+
+
+def _by_scene(rows: Sequence[Row]) -> str:
+    """A line a scene: how many pixels it covers, and every method's error there."""
+    lines = []
+    for name in dict.fromkeys(row["name"] for row in rows):
+        pooled = mean_rows([row for row in rows if row["name"] == name])
+        errors = {row["method"]: row["relative_mse_2d"] for row in pooled}
+        lines.append({"scene": name, "pixels": round(pooled[0]["pixels"])} | errors)
+    return report.table_of(lines, {column: column for column in lines[0]})
 
 
 def _of_light(m: Mapping[str, Any]) -> str:

@@ -235,16 +235,18 @@ def ray_row(view: View, radius: float, rays: int, seed: int) -> Row:
 
 
 def mean_rows(rows: Sequence[Row]) -> list[Row]:
-    """Rows of the same method averaged over the objects, in order of appearance."""
+    """Means over the shots of each method; relative errors as ratios of means."""
     methods: dict[str, list[Row]] = {}
     for row in rows:
         methods.setdefault(row["method"], []).append(row)
-    return [
-        {"method": method, "objects": len(group)}
-        | {
-            name: float(np.mean([row[name] for row in group]))
-            for name in group[0]
-            if name not in ("method", "name")
-        }
-        for method, group in methods.items()
-    ]
+    means = []
+    for method, group in methods.items():
+        numbers = [
+            k for k, v in group[0].items() if isinstance(v, int | float | np.number)
+        ]
+        mean = {k: float(np.mean([row[k] for row in group])) for k in numbers}
+        if "variance_2d" in mean:
+            relative = relative_error(mean["mse_2d"], mean["variance_2d"])
+            mean["relative_mse_2d"] = relative
+        means.append({"method": method, "shots": len(group)} | mean)
+    return means

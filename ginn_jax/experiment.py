@@ -147,6 +147,11 @@ def bar(console: Console) -> Progress:
     return Progress(*text, *columns, console=console, disable=not console.is_terminal)
 
 
+def learned(settings: Any, sources: Sequence[Source]) -> dict[str, Any]:
+    """What a run records of what it learns from: how its clouds are made, of what."""
+    return {"data": asdict(settings), "objects": [source.name for source in sources]}
+
+
 def train(
     console: Console,
     config: Training,

@@ -2,7 +2,8 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import jax
@@ -18,6 +19,7 @@ from ginn_jax.experiment import (
     check_run,
     closing,
     errors_by_set,
+    learned,
     make,
     on_disk,
     train,
@@ -27,7 +29,6 @@ from ginn_jax.lit_clouds import LitCloud, split_points, unit_floor
 from ginn_jax.lit_options import LitOptions, choose_sources
 from ginn_jax.lit_report import halves_by_medium, write_report
 from ginn_jax.lit_scenes import Illumination, Scattering
-from ginn_jax.metrics import relative_error
 from ginn_jax.objects import Source
 from ginn_jax.pairing import PAPER_SPLIT
 from ginn_jax.recipe import Training
@@ -61,7 +62,7 @@ def run_experiment(
     clock.lap("data", begin)
 
     config = training(options, network, settings.points, len(clouds))
-    extra = {"data": asdict(settings), "objects": [s.name for s in seen]}
+    extra = learned(settings, seen)
     run = train(console, config, clouds, options, extra, clock)
 
     begin = time.perf_counter()
@@ -103,7 +104,8 @@ def evaluation(
         )
     each = [row for rows in found.values() for row in rows]
     metrics = errors_by_set(found) | halves_by_medium(each)
-    firsts = (list(zip(unseen[n], clouds[n], strict=True))[:2] for n in unseen)
+    # Not all at once: the clouds may stay on disk.
+    firsts = (islice(zip(unseen[n], clouds[n], strict=True), 2) for n in unseen)
     shown = [pair for pairs in firsts for pair in pairs][:6]
     images = image_evaluation(options, config, limits, model, settings, shown)
     return metrics | images
@@ -123,22 +125,22 @@ def image_evaluation(
     for source, cloud in shown:
         view = evaluate_light.lit_view(source, settings, paths, options.resolution)
         cloud = split_points(cloud, count_given(len(cloud.position)))[0]
-        given = config.network, limits, model, cloud, view
-        row, values, encoded, limits = evaluate_light.lit_network_row(*given)
+        ends = model, cloud, view
+        row, values, encoded, limits = evaluate_light.lit_network_row(
+            config.network, limits, *ends
+        )
         units = np.asarray(encoded.scale)
         rows.append(row | {"name": source.name})
         pictures.append((source.name, panels(view, values)))
         if options.resolution_scale < 1:
             row, _, _, limits = evaluate_light.lit_network_row(
-                *given, options.resolution_scale
+                config.network, limits, *ends, options.resolution_scale
             )
             rows.append(row | {"name": source.name})
         for count in PATH_COUNTS:
             row = evaluate_light.path_row(view, count, 1000, units)
             rows.append(row | {"name": source.name})
     means = mean_rows(rows)
-    for row in means:
-        row["relative_mse_2d"] = relative_error(row["mse_2d"], row["variance_2d"])
     groups = {
         "network (f_3D + f_2D)": [r for r in means if "paths" not in r],
         "path tracing": [r for r in means if "paths" in r],

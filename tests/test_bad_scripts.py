@@ -4,14 +4,16 @@ Who typed a command sees no traceback: one line, and 2 for their mistakes, 1 for
 """
 
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import tyro
 from damaged import contents
 
-from benchmarks import neighbors, relight, scaling
+from benchmarks import f2d, neighbors, relight, scaling
 from experiments import animation, ao_train, evaluate, gi_train
 from ginn_jax import (
     commandline,
@@ -72,6 +74,13 @@ SEVERAL = [
     (neighbors, ("--radii", ".1", "0"), "--radii is 0.0: give it above 0"),
     (scaling, ("--points", "1000", "-4"), "--points is -4: give at least 100"),
     (scaling, ("--points", "1000"), "--points has 1 values: give at least 2"),
+    (f2d, ("--disks", ".01"), "--disks are 1, --radii 4: give as many"),
+    (
+        evaluate,
+        ("--disks", "9"),
+        "Poisson radius 0.18: must lie between 0 and the",
+    ),
+    (evaluate, ("--beside", "nope"), "nope"),
     (relight, ("--networks",), "--networks has 0 values: give at least 1"),
 ]
 
@@ -144,3 +153,12 @@ def test_a_folder_that_is_a_file_ends_in_one_line_and_code_2(tmp_path):
     assert len(said.stderr.strip().splitlines()) == 1
     assert str(tmp_path / "file") in said.stderr
     assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_the_command_that_is_recorded_runs_again():
+    """Whatever is in the names of files."""
+    options = evaluate.Options(meshes=Path("my meshes"), counts=(1, 2), quick=True)
+    words = shlex.split(commandline.command_line("experiments.evaluate", options))
+    assert words[:3] == ["python", "-m", "experiments.evaluate"]
+    again = tyro.cli(evaluate.Options, args=words[3:])
+    assert again == options

@@ -8,7 +8,9 @@ import pytest
 import tiny
 
 from benchmarks import departures, networks
+from ginn_jax import compare_networks
 from ginn_jax.presets import PAPER
+from ginn_jax.run_record import RECORD, read_record
 
 
 @pytest.mark.usefixtures("small_programs")
@@ -91,3 +93,6 @@ def test_departures(tmp_path, monkeypatch):
     assert np.isfinite(row["relative, shapes"])
     assert row["3d_ms"] > 0 < row["2d_ms"]
     assert "ours" in (tmp_path / "report.md").read_text()
+    # For those who compare it with other runs.
+    assert compare_networks.learned_from(str(tmp_path / "ours"))["radius"] == 0.1
+    assert "shape_0" in read_record(tmp_path / "ours" / RECORD, "")["objects"]

@@ -1,6 +1,7 @@
 """Comparisons: fronts and lost cells by definition, methods on the same pixels."""
 
 import json
+import re
 import sys
 from dataclasses import replace
 from types import SimpleNamespace
@@ -20,10 +21,9 @@ from ginn_jax.compare_report import (
     RIVALS,
     lost_cells,
     pareto_front,
-    pool_shots,
 )
 from ginn_jax.errors import InputError
-from ginn_jax.evaluate import Model
+from ginn_jax.evaluate import Model, mean_rows
 
 numbers = st.floats(1e-3, 1e3)
 rows = st.lists(st.tuples(numbers, numbers), min_size=1, max_size=12).map(
@@ -70,7 +70,7 @@ def test_pooled_relative_error_is_a_ratio_of_means():
         {"method": "a", "mse_2d": 1.0, "variance_2d": 1.0, "relative_mse_2d": 1.0},
         {"method": "a", "mse_2d": 1.0, "variance_2d": 9.0, "relative_mse_2d": 1 / 9},
     ]
-    [pooled] = pool_shots(shots)
+    [pooled] = mean_rows(shots)
     assert pooled["relative_mse_2d"] == pytest.approx(0.2)
     assert pooled["shots"] == 2
 
@@ -257,6 +257,11 @@ def test_comparison_ends_in_a_report_and_keeps_its_references(tmp_path):
     assert front["run run"]["mse_2d"] == front[OURS]["mse_2d"]
     text = (tmp_path / "out" / "report.md").read_text()
     assert all(name in text for name in (*names, "rays of equal MSE"))
+    scene, pixels, *found = re.search(r"\| (shape_.*) \|", text)[1].split(" | ")
+    assert [scene] == first["names"]
+    assert 48**2 / 4 < int(pixels) == first["rows"][0]["pixels"] < 48**2
+    relative = [row["relative_mse_2d"] for row in first["results"]]
+    assert [float(word) for word in found] == pytest.approx(relative, rel=1e-3)
     errors = {row["method"]: row["mse_2d"] for row in first["results"]}
     counted, _ = first["light_counted"]
     assert counted["mse_2d"] == front[OURS]["mse_2d"]

@@ -18,7 +18,7 @@ from ginn_jax import (
 )
 from ginn_jax.compare import Picture
 from ginn_jax.compare_networks import OURS
-from ginn_jax.compare_report import pool_shots, summary
+from ginn_jax.compare_report import summary
 from ginn_jax.compare_screen import screen_methods
 from ginn_jax.dataset import ShadedPoints
 from ginn_jax.evaluate import Model
@@ -175,7 +175,7 @@ def test_rows_that_differ_are_pooled_by_their_means():
     assert relative == pytest.approx((0.9, 0.5))
     assert pooled["equal_rays"] == pytest.approx(4 / 3)
     shots = [{"method": "a", "mse_2d": m, "variance_2d": 4.0} for m in (1.0, 3.0)]
-    assert pool_shots(shots)[0]["mse_2d"] == 2
+    assert evaluate.mean_rows(shots)[0]["mse_2d"] == 2
     means = evaluate.mean_rows([shots[0], shots[1] | {"method": "b"}, shots[1]])
     assert [row["mse_2d"] for row in means] == [2, 3]
 

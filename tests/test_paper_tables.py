@@ -18,7 +18,7 @@ def measured(folder, effect, worse, processor="a processor"):
     metrics = {
         "results": rows,
         "lost_cells": ["dssim_2d: screen space 0.1, ours 0.4"],
-        "options": {"resolution": "64"},
+        "options": {"effect": effect, "resolution": "64"},
         "environment": {"processor": processor},
     }
     place = folder / f"evaluate_{effect}"
@@ -59,3 +59,25 @@ def test_every_processor_is_named(tmp_path, other, said):
         measured(tmp_path, effect, 1, "a processor" if effect == "ao" else other)
     paper_tables.main(paper_tables.Options(tmp_path, tmp_path / "out"))
     assert said in (tmp_path / "out" / "report.md").read_text()
+
+
+def test_an_evaluation_of_another_effect_is_refused(tmp_path):
+    for effect in paper_tables.EFFECTS:
+        measured(tmp_path, effect, 1)
+    (tmp_path / "evaluate_sss").rename(tmp_path / "other")
+    (tmp_path / "evaluate_gi").rename(tmp_path / "evaluate_sss")
+    (tmp_path / "other").rename(tmp_path / "evaluate_gi")
+    with pytest.raises(InputError, match=r"evaluate_gi.*is of another effect: run"):
+        paper_tables.main(paper_tables.Options(tmp_path, tmp_path / "out"))
+
+
+@pytest.mark.parametrize("lacking", ["results", "options", "environment", "lost_cells"])
+def test_what_is_no_evaluation_is_refused(lacking, tmp_path):
+    for effect in paper_tables.EFFECTS:
+        measured(tmp_path, effect, 1)
+    place = tmp_path / "evaluate_gi" / "metrics.json"
+    found = json.loads(place.read_text())
+    del found[lacking]
+    place.write_text(json.dumps(found))
+    with pytest.raises(InputError, match=r"^\S*evaluate_gi/metrics.json is damaged"):
+        paper_tables.main(paper_tables.Options(tmp_path, tmp_path / "out"))
