@@ -16,8 +16,7 @@ class Case(NamedTuple):
     """A cloud in float64 with unit normals, material and light, and what it is called.
 
     `scale` multiplies all radii. Light and material are [C N 1], albedo and what the
-    surface sends out. Rows beyond `count` are padding. `moved` is how far the cloud was
-    shifted.
+    surface sends out. Rows beyond `count` are padding.
     """
 
     name: str
@@ -27,7 +26,6 @@ class Case(NamedTuple):
     albedo: np.ndarray
     count: int = POINTS
     scale: float = 1.0
-    moved: float = 0.0
 
 
 def small_network(scale: float = 1.0) -> Network:
@@ -107,7 +105,7 @@ def clouds() -> Iterator[Case]:
     for power in (3, 4, 6):
         moved = 10.0**power
         name = f"at 1e{power}"
-        yield case(name, position + moved, normal, light=base.light, moved=moved)
+        yield case(name, position + moved, normal, light=base.light)
 
 
 def lights() -> Iterator[Case]:
