@@ -18,25 +18,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.in_blocks import block_memory, blocks_call
 from benchmarks.straightforward import shade_plainly
 from benchmarks.timing import Timing, describe, measure, write_cases
-from ginn_jax import block_shading, blocks, image, inference, objects, reference, report
+from ginn_jax import image, inference, objects, reference, report
 from ginn_jax.architecture import Network
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, require_positive, require_some, start
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import at_scale
-from ginn_jax.limits import Limits, only
 from ginn_jax.mesh import find_meshes
 from ginn_jax.network import Variables
 from ginn_jax.presets import compact_network
-from ginn_jax.process import on_cpu
 from ginn_jax.receptive_field import Oriented
 from ginn_jax.recipe import Training
 from ginn_jax.reference import GBuffer, Scene
 from ginn_jax.searches import uniform_limits
+from ginn_jax.shading import Encoded
 from ginn_jax.train import init_state
-from ginn_jax.upsample import Surface
 from ginn_jax.visible import visible_samples
 
 # The paper's AO, whole network, 1024 x 1024, NVIDIA GTX 1080.
@@ -90,7 +89,7 @@ def make_frame(options: Options) -> tuple[Scene, GBuffer]:
 def plain_call(
     network: Network,
     variables: Variables,
-    encoded: image.Encoded,
+    encoded: Encoded,
     queries: Oriented,
 ) -> Callable[[], Any]:
     """The straightforward form with capacities that just suffice."""
@@ -163,43 +162,6 @@ def compare(
         "block_bytes": block_memory(network, fitting, variables, encoded),
         "timings": timings,
     }
-
-
-def blocks_call(
-    network: Network,
-    limits: Limits,
-    variables: Variables,
-    encoded: image.Encoded,
-    gbuffer: GBuffer,
-) -> tuple[Callable[[], Any], Limits]:
-    """f_2D in blocks, as a GPU runs it, to pixels and their values; limits that fit."""
-    surface = Surface(gbuffer.position, gbuffer.normal, gbuffer.mask)
-    encoded = block_shading.searchable(network, encoded)
-
-    def shade(limits: Limits) -> tuple[np.ndarray, np.ndarray, Limits]:
-        given = network, encoded.center, surface, (None, None)
-        rows, pixels, coherent = image.pixels_in_order(*given)
-        ends: Any = network, limits, variables, encoded, *pixels
-        return rows, *block_shading.shade_blocks(*ends, coherent=coherent)
-
-    fitting = shade(limits)[2]
-    return lambda: shade(fitting)[:2], fitting
-
-
-def block_memory(
-    network: Network, limits: Limits, variables: Variables, encoded: image.Encoded
-) -> int:
-    """Scratch memory of one block of f_2D, the same for every image, in bytes."""
-    rows = blocks.largest_block(lit=False)
-    encoded = block_shading.searchable(network, encoded)
-    zeros = np.zeros((rows, 3), np.float32)
-    queries = Oriented(zeros, zeros, np.ones(rows, bool))
-    flat = only(limits, network.query.name)
-    turn = blocks.turn_shapes(blocks.Turn(queries))
-    shared = blocks.everywhere((variables, encoded))
-    lowered = block_shading.shade_turn.lower(network, flat, on_cpu(), *shared, turn)
-    memory = lowered.compile().memory_analysis()
-    return int(memory.temp_size_in_bytes) if memory else 0
 
 
 def main(options: Options) -> dict[str, Any]:

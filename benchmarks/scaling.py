@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.f2d import block_memory, blocks_call
+from benchmarks.in_blocks import block_memory, blocks_call
 from benchmarks.timing import Timing, circumstances, describe, measure
 from ginn_jax import image, inference, objects, reference, report
 from ginn_jax.architecture import Network
