@@ -81,10 +81,7 @@ def emitter(light: Light) -> dict[str, Any]:
     """The light as a Mitsuba dictionary; call it with the variant set."""
     mi, _ = use_mitsuba()
     if isinstance(light, EnvironmentMap):
-        radiance = light.radiance
-        if radiance.shape[0] < 3 or radiance.shape[1] < 2:  # Mitsuba takes no smaller
-            radiance = radiance.repeat(3, axis=0).repeat(2, axis=1)
-        return {"type": "envmap", "bitmap": mi.Bitmap(radiance)}
+        return {"type": "envmap", "bitmap": mi.Bitmap(light.radiance)}
     return {
         "type": "point",
         "position": [float(x) for x in light.position],
