@@ -74,7 +74,8 @@ def pair_up(
         for k in range(each):
             light = lights[(i * each + k) % len(lights)]
             name = f"{source.name}__{light.name}"
-            # Materials and paths of its own, whatever else is paired.
+            # Under one light it keeps its seed, as in the runs of the manifest; under
+            # several, names tell materials apart, whatever else is paired.
             own = source.path is None and each == 1
             seed = source.seed if own else zlib.crc32(name.encode())
             pairs.append(replace(source, name=name, light=light, seed=seed))
