@@ -197,7 +197,7 @@ def measure_demands(
     `probe(limits, i)` builds the geometry of example i. `limits` should be generous,
     and name stages in the order in which they build on each other: the first `FEW`
     examples are probed with them, any others with `AMPLE` times what those needed at
-    the most. Every limit that is raised costs a compilation.
+    the most. Every time that limits are raised costs a compilation.
     """
     found: list[dict[str, int]] = []
     # Kept, for demands come back from jit sorted by name, and so do limits of them.
@@ -214,15 +214,19 @@ def measure_demands(
 
 
 def first_stage(short: dict[str, int], order: Sequence[str]) -> dict[str, int]:
-    """Those of the first search, or the first level's points, that lacked room.
+    """Those of the first level's search or points that lacked room, or all others.
 
     What later stages say they need means nothing yet: a Poisson disk that misses edges
-    keeps too many points.
+    keeps too many points. Searches on levels that are whole do not hang on each other.
     """
 
     def stage(name: str) -> str:
+        if name not in of_levels:
+            return "other"
         return name if name.endswith(".points") else name.rpartition(".")[0]
 
+    levels = [i for i, name in enumerate(order) if name.endswith(".points")]
+    of_levels = order[: max(levels, default=-1) + 1]
     first = stage(next(name for name in order if name in short))
     return {name: need for name, need in short.items() if stage(name) == first}
 

@@ -91,6 +91,22 @@ def test_what_an_overflow_garbles_is_not_made_room_for():
     assert [tried[-1].of(n) < 3 * need[n] for n in need] == [True] * 3
 
 
+def test_searches_on_whole_levels_are_made_room_for_at_once():
+    """Each time is a compilation."""
+    first = se.uniform_limits(SHALLOW, 100)
+    whole = [n for n, _ in first.sizes if n.startswith("level_")]
+    tried = []
+
+    def probe(limits, _):
+        tried.append(limits)
+        return as_jax({n: 90 if n in whole else 5000 for n, _ in limits.sizes})
+
+    first = lm.Limits(tuple((n, max(size, 100)) for n, size in first.sizes))
+    found = lm.measure_limits(first, probe, 1, slack=1.0)
+    assert {found.of(n) >= 5000 for n, _ in first.sizes if n not in whole} == {True}
+    assert len(tried) == 2
+
+
 def test_limits_are_named_in_the_order_of_the_pipeline(shallow):
     """What lacks room changes nothing of what comes before."""
     name = "level_0.edges"
