@@ -35,6 +35,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     neighbors         radius search on the host: exact, sizes itself
     hierarchy         Poisson disk sampling
     receptive_field   what an edge shows a kernel, what its sender weighs
+    density           the paper's weights, by every pair of neighbours
     kernels           perceptrons from what an edge shows to kernel values
     mcconv            Monte Carlo convolution, tile by tile
     dataset           shaded points: one type for a cloud and for a G-buffer

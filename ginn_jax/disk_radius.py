@@ -64,5 +64,4 @@ def _search_powers(name: str, source: int, target: int) -> dict[str, float]:
         f"{name}.candidates": near,
         f"{name}.words": near,
         f"{name}.edges": 0.85 * (senders + receivers),
-        f"{name}.pairs": 1.6 * senders + 0.8 * receivers,
     }

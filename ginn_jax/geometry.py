@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Int, Key
 
 from ginn_jax.architecture import Conv, Network
 from ginn_jax.candidates import PACKET
+from ginn_jax.density import kde_weight
 from ginn_jax.facets import Around, facet_field, smooth_normals
 from ginn_jax.hierarchy import same_side
 from ginn_jax.levels import build_levels, grid_of, with_normals
@@ -20,7 +21,6 @@ from ginn_jax.packets import Edges
 from ginn_jax.receptive_field import (
     Field,
     Oriented,
-    kde_weight,
     kernel_inputs,
     point_area,
     surface_weight,
@@ -65,33 +65,25 @@ def turn_edges(edges: Edges, senders: int, receivers: int) -> Edges:
 def receptive_field(
     network: Network,
     conv: Conv,
-    limits: Limits,
     senders: Oriented,
     receivers: Oriented,
     edges: Edges,
     area: Array | None,
     taper: float = 0.0,
-) -> tuple[Field, Demands]:
+) -> Field:
     """Kernel inputs and weights of every edge; `area` is of the senders."""
     radius = jnp.float32(conv.radius)
     inputs = kernel_inputs(senders, receivers, edges, radius, network.oriented)
-    demands: Demands = {}
+    count = receivers.mask.shape[0]
     if area is None:
-        name = f"{conv.name}.pairs"
-        weight, demands[name] = kde_weight(
-            senders.position,
-            receivers.position,
-            edges,
-            radius,
-            conv.bandwidth,
-            limits.of(name),
-        )
+        given = senders.position, edges, count, radius, conv.bandwidth
+        weight = kde_weight(*given)
     else:
-        weight = surface_weight(area, edges, receivers.mask.shape[0], radius)
+        weight = surface_weight(area, edges, count, radius)
     if taper:
         weight = weight * window(inputs, taper)
-    count = edges.demand.edges
-    return Field(edges.sender, edges.receiver, inputs, weight, count), demands
+    real = edges.demand.edges
+    return Field(edges.sender, edges.receiver, inputs, weight, real)
 
 
 def build_geometry(
@@ -141,8 +133,7 @@ def build_geometry(
     for conv in network.encoder:
         ends = levels[conv.source], levels[conv.target]
         given = *ends, found[conv.name], areas.get(conv.source), network.taper
-        fields[conv.name], more = receptive_field(network, conv, limits, *given)
-        demands |= more
+        fields[conv.name] = receptive_field(network, conv, *given)
     grid = grid_of(network, grids, 0, finest)
     known = levels, rows[0], fields, areas.get(0), grid
     return Geometry(*known, facets, around, kept), demands
@@ -179,7 +170,5 @@ def build_query_field(
 ) -> tuple[Field, Demands]:
     """The field of f_2D: from the finest level, its grid and areas, to the queries."""
     edges, demands = search(network.query, limits, grid, queries, packet)
-    field, more = receptive_field(
-        network, network.query, limits, finest, queries, edges, area
-    )
-    return field, demands | more
+    ends = finest, queries, edges, area
+    return receptive_field(network, network.query, *ends), demands

@@ -166,28 +166,6 @@ def _sum_tiles(counts: Int[Array, "K"], count: Int[Array, ""]) -> Int[Array, "K"
     return summed[: counts.shape[0]]
 
 
-class Expansion(NamedTuple):
-    """Slots of all ranges one after the other: range, its row, and whether real."""
-
-    owner: Int[Array, "K"]
-    row: Int[Array, "K"]
-    valid: Bool[Array, "K"]
-
-
-def expand_ranges(
-    start: Int[Array, "R"], length: Int[Array, "R"], capacity: int
-) -> tuple[Expansion, Int[Array, ""]]:
-    """List rows start .. start + length of every range, and how many there are in all.
-
-    Slots that are not valid still name some range.
-    """
-    slots = range_slots(length, capacity)
-    shift = start - slots.begin
-    row = fill(lambda k: k + shift[slots.owner[k]], slots.total, capacity)
-    valid = jnp.arange(capacity, dtype=jnp.int32) < slots.total
-    return Expansion(slots.owner, row, valid), slots.total
-
-
 def compact(
     keep: Bool[Array, "K"], capacity: int
 ) -> tuple[Int[Array, "E"], Bool[Array, "E"], Int[Array, ""]]:

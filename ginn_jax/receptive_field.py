@@ -4,7 +4,7 @@ A sender's weight is what remains of the density of the Monte Carlo estimate (pa
 appendix; `mcconv` has the sum). No parameter enters it:
 
     kde      w_j = 1 / sum_{k in N(x)} G((y_k - y_j) / (h r)), the paper's, for every
-             pair of neighbours of every receiver: O(|N|^2)
+             pair of neighbours of every receiver: O(|N|^2), see `density`
     surface  w_j = A_j / (pi r^2), where A_j is the area that sender j stands for, once
              for every sender: O(|N|), and unmoved by a change of sampling density
 
@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ginn_jax.hierarchy import squared_lengths
 from ginn_jax.packets import Edges
 from ginn_jax.process import on_cpu
-from ginn_jax.ranges import expand_ranges, over_tiles
+from ginn_jax.ranges import over_tiles
 from ginn_jax.voxels import morton_order
 
 TILE = 8192
@@ -160,38 +160,6 @@ def _inputs_backward(
 
 
 _inputs_in_tiles.defvjp(_inputs_forward, _inputs_backward)
-
-
-def kde_weight(
-    senders: Float[Array, "N 3"],
-    receivers: Float[Array, "M 3"],
-    edges: Edges,
-    radius: Float[Array, ""],
-    bandwidth: float,
-    pairs: int,
-) -> tuple[Float[Array, "E"], Int[Array, ""]]:
-    """The paper's weight of each edge, and the number of pairs it looked at.
-
-    Gaussian kernel density of width h r in units where r = 1, evaluated at the sender
-    over all senders of the same receiver, itself included. `pairs` is a capacity.
-    """
-    count = receivers.shape[0]
-    first = jnp.searchsorted(edges.receiver, jnp.arange(count + 1)).astype(jnp.int32)
-    real = edges.receiver < count
-    receiver = jnp.where(real, edges.receiver, 0)
-    length = jnp.where(real, first[receiver + 1] - first[receiver], 0)
-    slots, demand = expand_ranges(first[receiver], length, pairs)
-    mine, other = edges.sender[slots.owner], edges.sender[slots.row]
-    offset = (senders[other] - senders[mine]) / (radius * bandwidth)
-    constant = (0.5 / jnp.pi) ** 1.5 / bandwidth**3
-    value = constant * jnp.exp(-0.5 * jnp.sum(offset**2, axis=-1))
-    density = jax.ops.segment_sum(
-        jnp.where(slots.valid, value, 0.0),
-        slots.owner,
-        edges.sender.shape[0],
-        indices_are_sorted=True,
-    )
-    return jnp.where(real, 1 / jnp.where(real, density, 1.0), 0.0), demand
 
 
 def point_area(

@@ -57,8 +57,6 @@ def limit_names(network: Network) -> tuple[str, ...]:
     more = [area_search(network)] if needs_areas(network) else []
     for conv in (*facet_searches(network), *own, *more, network.query):
         names += search_names(conv.name)
-    if network.density == "kde":
-        names += [f"{conv.name}.pairs" for conv in (*network.encoder, network.query)]
     return tuple(names)
 
 

@@ -15,34 +15,33 @@ from strategies import ALL_PAIRS, POINTS, QUERIES, SEEDS, UNIT, lattice, pad
 from ginn_jax import kernels
 from ginn_jax import mcconv as mc
 from ginn_jax import receptive_field as rf
+from ginn_jax.density import kde_weight
 from ginn_jax.packets import radius_edges
 from ginn_jax.voxels import build_grid
 
 CHANNELS, OUTPUTS, HIDDEN, BANDWIDTH = 3, 2, 5, 0.3
-PAIRS = POINTS * POINTS * QUERIES
 # What weighs the senders, and whether kernels see normals.
 VARIANTS = pytest.mark.parametrize("variant", [("kde", False), ("surface", True)])
 MIXES = pytest.mark.parametrize("mixes", [False, True])
 
 
-@partial(jax.jit, static_argnames=("variant", "pairs"))
-def field_of(senders, receivers, radius, variant, pairs=PAIRS):
-    """The receptive field, and how many pairs its densities looked at."""
+@partial(jax.jit, static_argnames="variant")
+def field_of(senders, receivers, radius, variant):
+    """The receptive field."""
     density, oriented = variant
     grid = build_grid(senders.position, senders.mask, radius)
     limit = ALL_PAIRS
     edges = radius_edges(grid, receivers.position, receivers.mask, radius, limit)
     inputs = rf.kernel_inputs(senders, receivers, edges, radius, oriented)
-    positions = senders.position, receivers.position
+    count = receivers.mask.shape[0]
     if density == "kde":
-        weight, demand = rf.kde_weight(*positions, edges, radius, BANDWIDTH, pairs)
+        weight = kde_weight(senders.position, edges, count, radius, BANDWIDTH)
     else:
         own = radius_edges(grid, senders.position, senders.mask, radius, ALL_PAIRS)
         area = rf.point_area(senders.position, senders.mask, own, radius)
-        count = receivers.mask.shape[0]
-        weight, demand = rf.surface_weight(area, edges, count, radius), 0
-    count = edges.demand.edges
-    return rf.Field(edges.sender, edges.receiver, inputs, weight, count), demand
+        weight = rf.surface_weight(area, edges, count, radius)
+    real = edges.demand.edges
+    return rf.Field(edges.sender, edges.receiver, inputs, weight, real)
 
 
 @partial(jax.jit, static_argnames="mixes")
@@ -126,8 +125,7 @@ def dense_case():
 def value(case, variant, mixes=False, group=CHANNELS):
     """The convolution, all geometry included."""
     radius = np.float32(case.radius)
-    field, demand = field_of(case.senders, case.receivers, radius, variant)
-    assert demand <= PAIRS
+    field = field_of(case.senders, case.receivers, radius, variant)
     values = CHANNELS * (OUTPUTS if mixes else 1)
     kernel = make_kernel(case.seed, field.inputs.shape[0], values, group)
     return np.asarray(apply(kernel, case.features, field, mixes))

@@ -19,7 +19,7 @@ NETWORKS = {
     "kde": compact_network(4, LEVELS[:1], query_radius=0.25, density="kde"),
 }
 SHALLOW = compact_network(4, (0.25,), query_radius=0.25, density="kde")
-GENEROUS = {"points": 512, "edges": 1 << 14, "candidates": 1 << 15, "pairs": 1 << 16}
+GENEROUS = {"points": 512, "edges": 1 << 14, "candidates": 1 << 15}
 GENEROUS |= {"columns": 1 << 12, "words": 1 << 10}
 
 

@@ -65,25 +65,36 @@ def test_step_is_timed_once_it_is_compiled_and_has_room(monkeypatch):
 
 
 def test_every_departure_is_left_out_alone_and_all_at_once():
-    ours, _, bare, *_ = departures.variants(departures.DEFAULT).values()
+    given = departures.variants(departures.DEFAULT, 3)
+    found = {name: variant.network for name, variant in given.items()}
+    ours, bare = found["ours"], found["without any"]
 
     def changes(network):
         pairs = ((f.name, getattr(network, f.name)) for f in fields(network))
         return {name for name, value in pairs if value != getattr(ours, name)}
 
-    found = departures.variants(ours).items()
-    changed = {name: changes(network) for name, network in found}
+    changed = {name: changes(network) for name, network in found.items()}
     for name, change in departures.WITHOUT.items():
         assert changed[f"without {name}"] == set(change)
     assert changed["without any"] == set().union(*departures.WITHOUT.values())
     same = "oriented", "density", "norm", "sided", "taper"
     assert [getattr(bare, n) for n in same] == [getattr(PAPER, n) for n in same]
+    trained = {
+        name: departures.run_of(departures.Options(seed=3), name, variant.training)
+        for name, variant in given.items()
+    }
+    assert len({run.out for run in trained.values()}) == len(given)
+    assert [n for n, run in trained.items() if run.seed != 3] == ["ours, other weights"]
+    adam = [n for n, run in trained.items() if run.schedule == "paper"]
+    assert adam == ["the paper's table and optimiser"]
+    assert found[adam[0]] == PAPER
 
 
 @pytest.mark.usefixtures("small_programs")
 def test_departures(tmp_path, monkeypatch):
     network, room = tiny.ONE_LEVEL, tiny.ONE_LEVEL_ROOM
-    monkeypatch.setattr(departures, "variants", lambda _: {"ours": network})
+    only = {"ours": departures.Variant(network, {})}
+    monkeypatch.setattr(departures, "variants", lambda *_: only)
     monkeypatch.setattr("ginn_jax.fit.training_room", lambda *_: room)
     options = departures.Options(
         tmp_path, steps=2, shapes=2, test_shapes=1, points=1000, rays=4, resolution=32

@@ -1,8 +1,7 @@
 """Every capacity, driven to exactly what is needed and to one below.
 
-`test_packets`, `test_hierarchy` and `test_receptive_field` do so by one cloud each,
-whose needs they count by hand; here clouds are drawn, and host-level calls are given
-too little.
+`test_packets` and `test_hierarchy` do so by one cloud each, whose needs they count by
+hand; here clouds are drawn, and host-level calls are given too little.
 """
 
 import re
@@ -20,7 +19,6 @@ from strategies import ALL_PAIRS, POINTS, SEEDS, UNIT, coordinates, pad
 
 from ginn_jax import block_shading, hierarchy, inference, packets, recipe, train
 from ginn_jax.limits import Limits
-from ginn_jax.receptive_field import kde_weight
 from ginn_jax.voxels import build_grid
 
 RADIUS = jnp.float32(0.297)  # no distance that clouds are drawn with
@@ -52,13 +50,6 @@ def level(cloud, seed, limit):
     return build_level(
         grid, *ends, RADIUS, limit, hierarchy.draw_lots(len(ends[0]), key=key)
     )
-
-
-@partial(jax.jit, static_argnames="pairs")
-def density(cloud, pairs):
-    edges = search(cloud, ALL_PAIRS)
-    position = cloud.position
-    return kde_weight(position, position, edges, RADIUS, 0.25, pairs), edges
 
 
 def room_for(demand, less=None):
@@ -125,19 +116,6 @@ def test_a_level_wants_what_it_says(cloud, seed):
         short, told = build(ALL_PAIRS, points - 1)
         assert told == need
         assert short.index[short.mask].tolist() == kept[:-1]
-
-
-@FEW
-@given(CROWDED)
-def test_a_density_wants_what_it_says(cloud):
-    (full, need), edges = jax.device_get(density(cloud, POINTS**3))
-    receivers = np.array([q for q, _ in listed(edges)], int)
-    assert need == (np.bincount(receivers) ** 2).sum()
-    if need > 1:
-        (exact, told), _ = jax.device_get(density(cloud, int(need)))
-        assert told == need
-        np.testing.assert_array_equal(exact, full)
-        assert jax.device_get(density(cloud, int(need) - 1))[0][1] == need
 
 
 # Host calls

@@ -36,7 +36,6 @@ def shallow():
         ("conv_0.columns", "query.columns"),
         ("level_0.words",),
         ("conv_0.edges", "query.edges"),
-        ("conv_0.pairs", "query.pairs"),
     ],
 )
 def test_limits_that_are_too_small_are_named(shallow, names):

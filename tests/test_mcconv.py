@@ -200,7 +200,7 @@ def test_a_splat_is_the_mean_of_what_is_near_and_faces_alike():
         np.float64(a) for a in (case.senders.normal, case.senders.position)
     )
     radius, variant = np.float32(case.radius), ("surface", True)
-    field, _ = field_of(case.senders, case.receivers, radius, variant)
+    field = field_of(case.senders, case.receivers, radius, variant)
     values = np.random.default_rng(0).normal(size=POINTS).astype(np.float32)
     found = jax.jit(splat, static_argnums=2)(jnp.asarray(values), field, QUERIES)
     area = oracles.Surface(places, case.senders.mask, case.radius).share

@@ -29,7 +29,7 @@ gradient = jax.jit(jax.grad(loss), static_argnames="mixes")
 
 def problem(case, variant, mixes):
     """Kernel and features, their field, a direction to differentiate in."""
-    field, _ = field_of(case.senders, case.receivers, np.float32(case.radius), variant)
+    field = field_of(case.senders, case.receivers, np.float32(case.radius), variant)
     count = CHANNELS * (OUTPUTS if mixes else 1)
     kernel = make_kernel(case.seed, field.inputs.shape[0], count, 2)
     width = OUTPUTS if mixes else CHANNELS

@@ -80,7 +80,7 @@ def queries(isolated=0):
 
 def limits_of(network, factor=1):
     sizes = {"columns": 8192, "candidates": 49152, "words": 2048}
-    sizes |= {"edges": 12288, "pairs": 196608, "points": ROWS}
+    sizes |= {"edges": 12288, "points": ROWS}
     names = limit_names(network)
     return Limits(tuple((n, int(factor * sizes[n.split(".")[-1]])) for n in names))
 

@@ -30,8 +30,7 @@ def test_demand_saturates_where_int32_would_wrap(total):
     length = np.full(9, total // 9, np.int64)
     length[0] += total - length.sum()
     length = jnp.asarray(length.astype(np.int32))
-    demand = rg.expand_ranges(jnp.zeros(9, jnp.int32), length, 64)[1]
-    assert int(demand) == min(total, INT32_MAX)
+    assert int(rg.range_slots(length, 64).total) == min(total, INT32_MAX)
 
 
 @given(st.integers(0, INT32_MAX), st.integers(0, INT32_MAX))
@@ -41,25 +40,18 @@ def test_as_many_tiles_as_hold_the_rows(rows, size):
 
 
 @pytest.fixture(scope="module")
-def expand():
-    return jax.jit(rg.expand_ranges, static_argnames="capacity")
+def list_ranges():
+    return jax.jit(rg.range_slots, static_argnames="capacity")
 
 
 @pytest.mark.parametrize("capacity", [3, 5, 16, 128])
 @given(lengths=LENGTHS)
-def test_ranges_are_listed_in_order(expand, capacity, lengths):
-    starts = 100 * np.arange(len(lengths), dtype=np.int32)
-    rows = [
-        (i, s + k)
-        for i, (s, n) in enumerate(zip(starts, lengths, strict=True))
-        for k in range(n)
-    ]
-    slots, total = jax.tree.map(
-        np.asarray, expand(starts, np.array(lengths, np.int32), capacity)
-    )
-    listed = np.stack([slots.owner, slots.row], axis=1)[slots.valid]
-    assert total == len(rows)
-    assert listed.tolist() == [list(row) for row in rows[:capacity]]
+def test_ranges_are_listed_in_order(list_ranges, capacity, lengths):
+    owners = [i for i, n in enumerate(lengths) for _ in range(n)]
+    slots = list_ranges(np.array(lengths, np.int32), capacity)
+    assert slots.total == len(owners)
+    assert slots.owner[: len(owners)].tolist() == owners[:capacity]
+    np.testing.assert_array_equal(slots.begin, np.cumsum([0, *lengths[:-1]]))
 
 
 @pytest.fixture(scope="module")

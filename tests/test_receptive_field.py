@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conv_cases import cases, dense_case, field_of
+from conv_cases import cases, field_of
 from hypothesis import given
 from strategies import SEEDS
 
@@ -29,9 +29,7 @@ def test_rotation_turns_offsets_and_keeps_products(case, seed):
     ]
     inputs = []
     for senders, receivers in ((case.senders, case.receivers), turned):
-        field, _ = field_of(
-            senders, receivers, np.float32(case.radius), ("surface", True)
-        )
+        field = field_of(senders, receivers, np.float32(case.radius), ("surface", True))
         order = np.lexsort((field.sender, field.receiver))
         inputs.append(np.asarray(field.inputs).T[order])
     before, after = inputs
@@ -71,19 +69,6 @@ def test_kernel_inputs_have_the_gradient_of_their_formula(monkeypatch):
             high[end][place] += 1e-4
             expected = (total(*high) - total(*low)) / 2e-4
             np.testing.assert_allclose(slope[place], expected, rtol=1e-4, atol=1e-4)
-
-
-def test_density_tells_how_many_pairs_it_needs():
-    case, variant = dense_case(), ("kde", False)
-    near = [case.near(i) for i in np.flatnonzero(case.receivers.mask)]
-    need = sum(len(n) ** 2 for n in near)
-    args = case.senders, case.receivers, np.float32(case.radius), variant
-    full, demand = field_of(*args)
-    assert demand == need
-    exact, demand = field_of(*args, pairs=need)
-    assert demand == need
-    np.testing.assert_array_equal(exact.weight, full.weight)
-    assert field_of(*args, pairs=need - 1)[1] == need
 
 
 @jax.jit
