@@ -18,7 +18,7 @@ import numpy as np
 from rich.console import Console
 
 from benchmarks.timing import circumstances, describe
-from ginn_jax import evaluate_light, experiment, fit, report
+from ginn_jax import evaluate_light, experiment, fit, lit_views, report
 from ginn_jax.architecture import Network
 from ginn_jax.commandline import require_positive, require_some, start
 from ginn_jax.dataset import count_given
@@ -152,7 +152,7 @@ def errors_and_times(
         rows, limits = evaluate_light.evaluate_lit_clouds(*given)
         found[f"relative, {name}"] = pool_rows(rows)["relative_mse_3d"]
     sources, some = next(iter(tests.values()))
-    view = evaluate_light.lit_view(sources[0], settings, 2, size)
+    view = lit_views.lit_view(sources[0], settings, 2, size)
     cloud = split_points(some[0], count_given(len(some[0].position)))[0]
     row = evaluate_light.lit_network_row(network, limits, model, cloud, view)[0]
     parts = "seconds_3d", "seconds_2d"

@@ -22,9 +22,9 @@ from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, require_some, start
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model
-from ginn_jax.evaluate_light import encode_lit
 from ginn_jax.limits import Limits
 from ginn_jax.lit_clouds import LitCloud, network_numbers
+from ginn_jax.lit_views import encode_lit
 from ginn_jax.pretrained import load_any
 from ginn_jax.reference import GBuffer
 from ginn_jax.relight import prepare_relighting, relight

@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from ginn_jax import compare, evaluate_light, report
+from ginn_jax import compare, lit_views, report
 from ginn_jax.camera import orbit_camera
 from ginn_jax.commandline import require, start
 from ginn_jax.errors import InputError
@@ -101,9 +101,9 @@ def main(options: Options) -> dict[str, Any]:
         for name, light in lights.items():
             lit = light_mesh(mesh, light, settings, seed=options.seed)
             cloud = lit_points(lit, samples, settings.looks, seed=options.seed)
-            view = evaluate_light.lit_frame(lit, camera, settings, seed=options.seed)
-            truth = evaluate_light.traced(view, options.reference, seed=options.seed)
-            view = evaluate_light.with_truth(view, truth)
+            view = lit_views.lit_frame(lit, camera, settings, seed=options.seed)
+            truth = lit_views.traced(view, options.reference, seed=options.seed)
+            view = lit_views.with_truth(view, truth)
             if ready is None:
                 key = jax.random.key(options.seed)
                 given = config.network, limits, weights, cloud, view.pixels
@@ -111,7 +111,7 @@ def main(options: Options) -> dict[str, Any]:
             values = relight(config.network, weights, ready, cloud, view.pixels)
             row = compare.errors(view, values, mean_light(cloud))
             rows.append({"light": name} | row)
-            shown = (evaluate_light.displayed(view, v) for v in (truth.mean, values))
+            shown = (lit_views.displayed(view, v) for v in (truth.mean, values))
             pictures.append((name, *shown))
             progress.advance(task)
     metrics = {

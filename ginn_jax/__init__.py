@@ -85,6 +85,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     screen_scattering subsurface scattering from the screen alone
     metrics           errors, noise floors, equal ray counts
     evaluate          errors of ambient occlusion: points, images, against run time
+    lit_views         lit scenes seen by a camera, and networks on them
     evaluate_light    the same for effects that carry light
     pretrained        the trained networks that come with the package
     compare           shots, and the errors of the pictures that methods make of them

@@ -12,14 +12,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ginn_jax import evaluate, evaluate_light
+from ginn_jax import evaluate, evaluate_light, lit_views
 from ginn_jax.camera import Camera
 from ginn_jax.dataset import count_asked
 from ginn_jax.estimates import ColorEstimate
 from ginn_jax.evaluate import Row, View
-from ginn_jax.evaluate_light import LitView
 from ginn_jax.lighting import find_environments
 from ginn_jax.lit_scenes import Illumination, Lit, Scattering, light_up
+from ginn_jax.lit_views import LitView
 from ginn_jax.mesh import Mesh, find_meshes
 from ginn_jax.metrics import relative_error
 from ginn_jax.objects import (
@@ -101,7 +101,7 @@ def take_shot(stage: Stage, camera: Camera, settings: Settings, *, seed: int) ->
     if isinstance(stage, Mesh):
         return evaluate.frame(stage, camera)
     assert not isinstance(settings, Occlusion)
-    return evaluate_light.lit_frame(stage, camera, settings, seed=seed)
+    return lit_views.lit_frame(stage, camera, settings, seed=seed)
 
 
 def with_truth(shot: Shot, truth: Truth) -> Shot:
@@ -110,7 +110,7 @@ def with_truth(shot: Shot, truth: Truth) -> Shot:
         assert isinstance(truth, Estimate)
         return evaluate.with_truth(shot, truth)
     assert isinstance(truth, ColorEstimate)
-    return evaluate_light.with_truth(shot, truth)
+    return lit_views.with_truth(shot, truth)
 
 
 def target_of(shot: Shot) -> Values:
@@ -138,7 +138,7 @@ def displayed(shot: Shot, pictures: list[Picture]) -> dict[str, np.ndarray]:
     if isinstance(shot, View):
         mask = shot.gbuffer.mask
         return {name: evaluate.fill(mask, v) for name, v in values.items()}
-    return {name: evaluate_light.displayed(shot, v) for name, v in values.items()}
+    return {name: lit_views.displayed(shot, v) for name, v in values.items()}
 
 
 def errors(shot: Shot, values: Values, units: Float[np.ndarray, "C"] | None) -> Row:

@@ -7,10 +7,10 @@ from jaxtyping import Bool
 from ginn_jax.compare import Shot, Values
 from ginn_jax.compare_networks import Trained, redrawn
 from ginn_jax.dataset import ShadedPoints
-from ginn_jax.evaluate_light import LitView, channels_of, encode_lit
 from ginn_jax.image import within_range
 from ginn_jax.inference import encode_cloud, nothing_kept, shade_points
 from ginn_jax.lit_clouds import LitCloud, network_numbers
+from ginn_jax.lit_views import LitView, channels_of, encode_lit
 
 
 class Playing(NamedTuple):

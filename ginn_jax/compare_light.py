@@ -16,9 +16,9 @@ from ginn_jax.compare import Shot, Stage, errors
 from ginn_jax.compare_networks import OURS, Trained, of_samples
 from ginn_jax.compare_pictures import first_samples, network_picture
 from ginn_jax.evaluate import Row, at_scale, timed
-from ginn_jax.evaluate_light import LitView
 from ginn_jax.lit_clouds import Cloud, LitCloud
 from ginn_jax.lit_scenes import Lit, lit_points, lit_samples
+from ginn_jax.lit_views import LitView
 from ginn_jax.mesh import Mesh
 from ginn_jax.reference import build_scene
 from ginn_jax.samples import Samples

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ginn_jax import evaluate, evaluate_light
+from ginn_jax import evaluate, evaluate_light, lit_views
 from ginn_jax.block_shading import shade_turn
 from ginn_jax.blocks import Turn, largest_block, turn_shapes
 from ginn_jax.compare import Picture, Shot, errors, of_variance, scratch_mib
@@ -164,7 +164,7 @@ def _encode(trained: Trained, cloud: Cloud) -> Encoded:
     """f_3D of a cloud."""
     network, limits, model = trained
     if isinstance(cloud, LitCloud):
-        return evaluate_light.encode_lit(network, limits, model, cloud)[0]
+        return lit_views.encode_lit(network, limits, model, cloud)[0]
     ends = model.variables, cloud.position, cloud.normal
     return encode_cloud(network, limits, *ends, key=model.key)[0]
 

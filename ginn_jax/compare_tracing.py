@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ginn_jax import evaluate, evaluate_light
+from ginn_jax import evaluate, lit_views
 from ginn_jax.compare import Picture, Shot, Truth, Values, errors, with_truth
 from ginn_jax.dataset import load_arrays, save_arrays
 from ginn_jax.errors import InputError
 from ginn_jax.estimates import ColorEstimate
 from ginn_jax.evaluate import Row, View, timed
-from ginn_jax.evaluate_light import LitView
+from ginn_jax.lit_views import LitView
 from ginn_jax.reference import Estimate
 from ginn_jax.scenes import Occlusion, Settings
 
@@ -25,7 +25,7 @@ def trace(shot: Shot, settings: Settings, count: int, *, seed: int) -> Truth:
     if isinstance(shot, View):
         assert isinstance(settings, Occlusion)
         return evaluate.traced(shot, settings.radius, count, seed=seed)
-    return evaluate_light.traced(shot, count, seed=seed)
+    return lit_views.traced(shot, count, seed=seed)
 
 
 def with_reference(

@@ -6,74 +6,28 @@ over channels and clouds as a ratio of means.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ginn_jax.architecture import Network
-from ginn_jax.camera import Camera, orbit_camera
 from ginn_jax.dataset import count_asked
-from ginn_jax.estimates import ColorEstimate
-from ginn_jax.evaluate import (
-    Image,
-    Model,
-    Row,
-    at_scale,
-    fill,
-    timed,
-    timed_network,
-)
-from ginn_jax.image import Encoded, shade_image
-from ginn_jax.inference import encode_cloud, shade_points
+from ginn_jax.evaluate import Image, Model, Row, at_scale, timed, timed_network
+from ginn_jax.image import Encoded
+from ginn_jax.inference import shade_points
 from ginn_jax.limits import Limits
 from ginn_jax.lit_clouds import LitCloud, network_numbers, split_points
-from ginn_jax.lit_scenes import (
-    Illumination,
-    Lit,
-    Scattering,
-    light_up,
-    lit_points,
-    transport,
+from ginn_jax.lit_scenes import Illumination, Scattering
+from ginn_jax.lit_views import (
+    LitView,
+    channels_of,
+    displayed,
+    encode_lit,
+    pixel_numbers,
+    shade_seen,
+    traced,
 )
 from ginn_jax.metrics import dssim, relative_error, tone_map
-from ginn_jax.objects import Source
-from ginn_jax.reference import GBuffer, build_scene, render_gbuffer
-from ginn_jax.samples import Samples
-
-
-class LitView(NamedTuple):
-    """One lit object seen by one camera; its foreground pixels are a cloud."""
-
-    lit: Lit
-    gbuffer: GBuffer
-    pixels: LitCloud
-
-
-def encode_lit(
-    network: Network,
-    limits: Limits,
-    model: Model,
-    cloud: LitCloud,
-    kept_before: Bool[Any, "L R"] | None = None,
-) -> tuple[Encoded, Limits]:
-    """f_3D of a cloud; all channels, or one where the light is grey."""
-    numbers = distinct_channels(*network_numbers(cloud))
-    ends = model.variables, cloud.position, cloud.normal
-    return encode_cloud(network, limits, *ends, *numbers, kept_before, key=model.key)
-
-
-def distinct_channels(
-    material: Float[np.ndarray, "3 N A"], light: Float[np.ndarray, "3 N L"]
-) -> tuple[Float[np.ndarray, "C N A"], Float[np.ndarray, "C N L"]]:
-    """One channel where all three are the same, as under grey light on grey things."""
-    same = all(np.array_equal(a[0], a[k]) for a in (material, light) for k in (1, 2))
-    return (material[:1], light[:1]) if same else (material, light)
-
-
-def channels_of(encoded: Encoded) -> slice:
-    """The channels that were encoded, all three or the first, for the queries."""
-    return slice(np.size(np.asarray(encoded.scale)))
 
 
 def evaluate_lit_clouds(
@@ -131,52 +85,6 @@ def in_units(squared: Float[np.ndarray, "C"], scale: Float[np.ndarray, "K"]) -> 
     return float(np.mean(squared[lit] / scale[lit] ** 2)) if lit.any() else float("nan")
 
 
-def lit_view(
-    source: Source,
-    settings: Illumination | Scattering,
-    paths: int,
-    size: int,
-) -> LitView:
-    """A source with its path-traced reference at every foreground pixel."""
-    camera = orbit_camera(width=size, height=size)
-    view = lit_frame(light_up(source, settings), camera, settings, seed=source.seed)
-    return with_truth(view, traced(view, paths, seed=source.seed))
-
-
-def lit_frame(
-    lit: Lit, camera: Camera, settings: Illumination | Scattering, *, seed: int
-) -> LitView:
-    """A lit scene seen by a camera, with direct light and no reference yet."""
-    gbuffer = render_gbuffer(build_scene(lit.scene.mesh), camera)
-    seen = gbuffer.position, gbuffer.normal, gbuffer.material
-    samples = Samples(*(a[gbuffer.mask] for a in seen))
-    pixels = lit_points(lit, samples, settings.looks, seed=seed)
-    return LitView(lit, gbuffer, pixels)
-
-
-def traced(view: LitView, paths: int, *, seed: int) -> ColorEstimate:
-    """Path tracing of the transported light at the pixels of a view."""
-    ends = view.pixels.position, view.pixels.normal
-    return transport(view.lit, *ends, paths=paths, seed=seed)
-
-
-def with_truth(view: LitView, truth: ColorEstimate) -> LitView:
-    """The view with a reference."""
-    pixels = view.pixels._replace(target=truth.mean, variance=truth.variance)
-    return view._replace(pixels=pixels)
-
-
-def displayed(
-    view: LitView, transported: Float[np.ndarray, "P 3"]
-) -> Float[np.ndarray, "H W 3"]:
-    """Radiance of the pixels: (direct + indirect) albedo / pi, or exitance / pi."""
-    pixels = view.pixels
-    if pixels.medium.size:
-        return fill(view.gbuffer.mask, transported / np.pi)
-    albedo = pixels.albedo[pixels.material]
-    return fill(view.gbuffer.mask, (pixels.irradiance + transported) * albedo / np.pi)
-
-
 def lit_image_errors(
     view: LitView, values: Float[np.ndarray, "P 3"], scale: Float[np.ndarray, "C"]
 ) -> Row:
@@ -204,31 +112,15 @@ def lit_network_row(
     scale: float = 1.0,
 ) -> tuple[Row, Float[np.ndarray, "P 3"], Encoded, Limits]:
     """Errors and times of the network on one object; its values and codes."""
-    mask = view.gbuffer.mask
-    pixels = view.gbuffer.position, view.gbuffer.normal, mask
-    material, light = (
-        np.stack([fill(mask, a) for a in number])
-        for number in network_numbers(view.pixels)
-    )
+    seen = pixel_numbers(view)
 
     def shade(limits: Limits, encoded: Encoded) -> tuple[Image, Limits]:
-        some = channels_of(encoded)
-        return shade_image(
-            network,
-            limits,
-            model.variables,
-            encoded,
-            *pixels,
-            background=0.0,
-            resolution_scale=scale,
-            material=material[some],
-            light=light[some],
-        )
+        return shade_seen(network, limits, model, encoded, view.gbuffer, seen, scale)
 
     encoded, image, limits, times = timed_network(
         limits, lambda limits: encode_lit(network, limits, model, cloud), shade
     )
-    values = np.broadcast_to(image[mask], view.pixels.target.shape)
+    values = np.broadcast_to(image[view.gbuffer.mask], view.pixels.target.shape)
     row = {"method": "network" + at_scale(scale)} | times
     errors = lit_image_errors(view, values, np.asarray(encoded.scale))
     return row | errors, values, encoded, limits

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from ginn_jax import evaluate_light, fit, report
+from ginn_jax import evaluate_light, fit, lit_views, report
 from ginn_jax.architecture import Network
 from ginn_jax.dataset import count_asked, count_given
 from ginn_jax.evaluate import Model, fill, mean_rows
@@ -123,7 +123,7 @@ def image_evaluation(
     rows, pictures = [], []
     paths = settings.paths // 4
     for source, cloud in shown:
-        view = evaluate_light.lit_view(source, settings, paths, options.resolution)
+        view = lit_views.lit_view(source, settings, paths, options.resolution)
         cloud = split_points(cloud, count_given(len(cloud.position)))[0]
         ends = model, cloud, view
         row, values, encoded, limits = evaluate_light.lit_network_row(
@@ -156,13 +156,13 @@ def image_evaluation(
     }
 
 
-def panels(view: evaluate_light.LitView, values: np.ndarray) -> list[np.ndarray]:
+def panels(view: lit_views.LitView, values: np.ndarray) -> list[np.ndarray]:
     """Displayed reference and prediction, then the indirect light of both alone.
 
     What leaves a medium is displayed as it is: there it comes once.
     """
     target, mask = view.pixels.target, view.gbuffer.mask
-    whole = [evaluate_light.displayed(view, light) for light in (target, values)]
+    whole = [lit_views.displayed(view, light) for light in (target, values)]
     if view.pixels.medium.size:
         return whole
     return [*whole, *(fill(mask, light) for light in (target, values))]

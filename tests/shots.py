@@ -5,8 +5,8 @@ import tiny
 
 from ginn_jax import evaluate
 from ginn_jax.evaluate import View, fill
-from ginn_jax.evaluate_light import LitView
 from ginn_jax.lit_clouds import LitCloud
+from ginn_jax.lit_views import LitView
 from ginn_jax.reference import Estimate, GBuffer
 
 

@@ -14,6 +14,7 @@ from ginn_jax import (
     compare_tracing,
     evaluate,
     evaluate_light,
+    lit_views,
     metrics,
 )
 from ginn_jax.compare import Picture
@@ -65,7 +66,7 @@ def test_what_is_displayed(medium):
     pixels, mask = shot.pixels, shot.gbuffer.mask
     own = pixels.albedo[pixels.material]
     radiant = pixels.target if medium else (pixels.irradiance + pixels.target) * own
-    found = evaluate_light.displayed(shot, pixels.target)
+    found = lit_views.displayed(shot, pixels.target)
     np.testing.assert_allclose(found[mask], radiant / np.pi, rtol=1e-5)
     assert not found[~mask].any()
     factor = np.ones_like(own) if medium else own
@@ -76,7 +77,7 @@ def test_one_channel_only_where_light_and_things_are_grey():
     grey = np.ones((3, 5, 1), np.float32)
     red = grey * np.float32([1, 2, 3])[:, None, None]
     count = {
-        (name, other): len(evaluate_light.distinct_channels(a, b)[0])
+        (name, other): len(lit_views.distinct_channels(a, b)[0])
         for name, a in (("grey", grey), ("red", red))
         for other, b in (("grey", grey), ("red", red))
     }

@@ -2,16 +2,20 @@
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 import tiny
+import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.image import imread
+from scans import write_points
 
 from benchmarks import poisson_radii, sample_counts
-from experiments import animation, environment_maps, evaluate, latent_features
+from experiments import animation, environment_maps, evaluate, latent_features, shade
 from ginn_jax import compare_networks, pretrained, train
 from ginn_jax.dataset import count_given
 from ginn_jax.errors import InputError
@@ -28,6 +32,9 @@ def untrained(effect):
     network = {"ao": plain, "gi": lit, "sss": scattering}[effect]
     config = replace(tiny.CONFIG, network=network)
     variables = jax.device_get(train.init_state(config).variables)
+    # Values about a half: below nothing, all are shown as nothing.
+    last = variables["shader"]["params"]["Dense_1"]
+    last["bias"] = last["bias"] + np.float32(0.5)
     return config, tiny.ONE_LEVEL_LIMITS, variables
 
 
@@ -38,7 +45,7 @@ def tiny_networks(monkeypatch, small_programs):
             return pretrained.load_network(effect, name)
         return untrained(effect)
 
-    for module in (compare_networks, environment_maps, latent_features):
+    for module in (compare_networks, environment_maps, latent_features, shade):
         monkeypatch.setattr(module, "load_network", load)
 
 
@@ -72,7 +79,7 @@ def test_animation_tells_the_flicker_of_every_method(tmp_path, effect, disks):
     assert all(name in text for name in methods)
 
 
-SCRIPTS = animation, environment_maps, evaluate, latent_features
+SCRIPTS = animation, environment_maps, evaluate, latent_features, shade
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
@@ -149,6 +156,57 @@ def test_every_disk_radius_has_its_time_and_its_errors(tmp_path):
     text = (tmp_path / "report.md").read_text()
     assert "those that come with the package" in text
     assert (tmp_path / "poisson_radii.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("effect", ["ao", "gi", "sss"])
+def test_an_object_is_shaded(tmp_path, effect):
+    options = shade.Options(
+        effect, tmp_path, resolution=40, points=1200, looks=8, albedo=(0.9, 0.1, 0.1)
+    )
+    shown = imread(shade.main(options))[..., :3]
+    values = np.load(tmp_path / "values.npy")
+    assert values.shape == (40, 40) if effect == "ao" else (40, 40, 3)
+    background, corner = (1, 1) if effect == "ao" else (0, 0)
+    assert (values[0, 0] == background).all()
+    assert (shown[0, 0] == corner).all()
+    some = shown[values != background] if effect == "ao" else shown[values.any(-1)]
+    assert 0 < len(some) < 40 * 40
+    assert len(np.unique(some)) > 10
+    if effect != "ao":  # of something red under light of any colour
+        assert some[:, 0].mean() > 1.1 * some[:, 2].mean()
+
+
+def test_the_points_of_a_scan_are_shaded(tmp_path):
+    normal = np.random.default_rng(0).normal(size=(900, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    position = 7 * normal + [40, 3, -5]
+    write_points(tmp_path / "scan.ply", np.concatenate([position, normal], axis=1))
+    options = shade.Options(out=tmp_path, scan=tmp_path / "scan.ply")
+    found = trimesh.load(shade.main(options))
+    values = np.load(tmp_path / "values.npy")
+    np.testing.assert_allclose(found.vertices, position, rtol=1e-6)
+    np.testing.assert_array_equal(found.colors[:, 1], np.round(255 * values))
+    assert values.min() >= 0
+    assert np.ptp(values) > 0.01
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"scan": Path("a.ply"), "effect": "gi"}, "--scan is for occlusion"),
+        ({"scan": Path("a.ply"), "mesh": Path("a.obj")}, "--scan is for occlusion"),
+        ({"scan": Path("no.ply")}, "no.ply: no such file"),
+        ({"envmap": Path("sky.hdr")}, "--envmap is light, occlusion has none"),
+        ({"effect": "sss", "ior": 2.0}, "--ior 2.0 must be"),
+        ({"effect": "sss", "extinction": 0.0}, "--extinction 0.0 must be"),
+        ({"effect": "gi", "albedo": (2.0, 0.0, 0.0)}, "an albedo above 1"),
+        ({"resolution_scale": 0.4}, "0.4"),
+    ],
+)
+def test_what_cannot_be_shaded_is_named(tmp_path, wrong, message):
+    usual = {"effect": "ao", "resolution": 32, "points": 1000, "looks": 1}
+    with pytest.raises(InputError, match=message):
+        shade.main(shade.Options(out=tmp_path / "out", **usual | wrong))
 
 
 @pytest.mark.parametrize("effect", ["ao", "gi"])

@@ -12,7 +12,7 @@ import tiny
 from benchmarks import frame, generation
 from benchmarks import relight as relight_benchmark
 from experiments import gi_train, sss_train
-from ginn_jax import blocks, evaluate, evaluate_light, presets, train
+from ginn_jax import blocks, evaluate, evaluate_light, lit_views, presets, train
 from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import LitCloud
 from ginn_jax.lit_options import LitOptions, choose_sources
@@ -231,9 +231,9 @@ def test_unlit_channels_have_no_say():
 
 def test_grey_light_on_grey_things_is_one_channel():
     numbers = np.random.default_rng(0).uniform(size=(1, 5, 1)).repeat(3, axis=0)
-    assert evaluate_light.distinct_channels(numbers, numbers)[0].shape[0] == 1
+    assert lit_views.distinct_channels(numbers, numbers)[0].shape[0] == 1
     coloured = numbers * np.array([1, 1, 2])[:, None, None]
-    assert evaluate_light.distinct_channels(numbers, coloured)[1].shape[0] == 3
+    assert lit_views.distinct_channels(numbers, coloured)[1].shape[0] == 3
 
 
 @pytest.mark.usefixtures("small_programs")

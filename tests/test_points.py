@@ -7,6 +7,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from scans import write_points
 from triangles import COORDINATE, CORNERS, clear_cut, cube, heron, soup
 
 from ginn_jax import mesh as gm
@@ -66,14 +67,6 @@ def test_ground_samples_match_the_density_of_the_cloud():
     )
     np.testing.assert_allclose(ground[:, 1], -0.5, atol=1e-3)
     assert 0.75 < np.abs(ground[:, [0, 2]]).max() <= 0.8
-
-
-def write_points(path, rows, names=("x", "y", "z", "nx", "ny", "nz")):
-    head = [f"element vertex {len(rows)}", *(f"property float {n}" for n in names)]
-    body = [" ".join(f"{value:.9g}" for value in row) for row in rows]
-    lines = ["ply", "format ascii 1.0", *head, "end_header", *body]
-    path.write_text("\n".join(lines) + "\n")
-    return path
 
 
 @settings(max_examples=25)
