@@ -5,7 +5,9 @@ compiles what all of them do at once.
 """
 
 import functools
+import threading
 import tracemalloc
+import weakref
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple
 
@@ -21,6 +23,8 @@ PACKET, NARROW = 8, 8
 
 # Programs that are kept, with weights of their own: those of a dozen networks.
 PROGRAMS, NEVER = 512, 1 << 30
+# Seconds that are waited for a thread which may have died.
+PATIENCE = 10.0
 
 # A number, or a few, in each lane.
 Lane = Any
@@ -55,8 +59,24 @@ def most_held_mib(call: Callable[[], Any]) -> float:
         call()
         _, most = tracemalloc.get_traced_memory()
     finally:
+        # Or that may crash: CPython's issue 128679, mended in 3.12 and later.
+        wait_for_thread(dr)
         tracemalloc.stop()
     return (most + dr.detail.malloc_watermark(backend) - held) / 2**20
+
+
+def wait_for_thread(dr: Any) -> None:
+    """Wait until the thread in which Dr.Jit lets go of NumPy's memory has nothing left.
+
+    It does so in turn: what is given to it last is let go of last.
+    """
+    gone, last = threading.Event(), np.zeros(1, np.float32)
+    weakref.finalize(last, gone.set)
+    held = dr.llvm.Float(last)
+    dr.eval(held + 1)
+    del held, last
+    dr.sync_thread()
+    gone.wait(PATIENCE)
 
 
 class Table(NamedTuple):

@@ -1,5 +1,8 @@
 """Loops over the points near a query or around it, cells, and what they read."""
 
+import tracemalloc
+import weakref
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -209,3 +212,26 @@ def test_rows_stand_side_by_side_in_every_channel():
     np.testing.assert_array_equal(found[..., :3], a[:, [3, 1]])
     np.testing.assert_array_equal(found[..., 3:4], b[:, [3, 1]])
     assert (found[..., 4:] == 0).all()
+
+
+def test_memory_is_let_go_of_before_counting_it_ends(monkeypatch):
+    """Tracing that stops while Dr.Jit's thread frees what was NumPy's may crash."""
+    dr, alive, stop = use_drjit(), [], tracemalloc.stop
+    wrapped = []
+
+    def busy():
+        column = np.ones(1 << 20, np.float32)
+        wrapped.append(weakref.ref(column))
+        lane = dr.llvm.Float(column)
+        for _ in range(300):
+            lane = dr.sin(lane)
+        dr.eval(lane)
+
+    def stopped():
+        alive.extend(ref() is not None for ref in wrapped)
+        stop()
+
+    monkeypatch.setattr(tracemalloc, "stop", stopped)
+    assert lanes.most_held_mib(busy) > 4
+    assert alive == [False, False]
+    assert not tracemalloc.is_tracing()
