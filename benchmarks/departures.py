@@ -220,11 +220,10 @@ def write_report(options: Options, rows: list[dict[str, Any]]) -> str:
 {options.steps} steps each on {options.shapes} shapes of {options.points} points at
 {options.rays} rays, batches of two; one run each, so that differences as small as that
 between the two rows of ours may be chance. Errors are those of unseen objects, noise
-subtracted; times those of an image of {options.resolution} x {options.resolution},
-in lanes where a network runs there, or by JAX, which takes longer.
-Without what: {changes}. The paper's
-optimiser: Adam at .005, times .7 every 10 epochs; the others: Muon and Adam at .01,
-decaying to zero.
+subtracted; times those of an image of {options.resolution} x {options.resolution}, in
+lanes where a network runs there, or by JAX, which takes longer. The paper's optimiser
+is Adam at .005, times .7 every 10 epochs; the others have Muon and Adam at .01,
+decaying to zero. Without what: {changes}.
 
 {describe()}
 
