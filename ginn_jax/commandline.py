@@ -35,15 +35,29 @@ def start(
     The exit code is 2 where the user can mend it: options, input, a disk that is full
     or not to be written to, too little memory. It is 1 where the mistake is ours, and
     130 where Ctrl-C stopped the run. With GINN_JAX_TRACEBACK set, what is ours comes
-    with its traceback.
+    with its traceback. Where nobody reads on, as after `| head`, it ends in silence.
     """
-    options = parse(kind, description)
+    try:
+        run(parse(kind, description), main, quick)
+    except BrokenPipeError:
+        # Or Python would say so once more, when it flushes at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+
+
+def run(
+    options: Options, main: Callable[[Options], Any], quick: Mapping[str, Any]
+) -> None:
+    """Run a script with these options and leave as `start` says."""
     tune_process()
     traced = bool(os.environ.get("GINN_JAX_TRACEBACK"))
     if not traced:
         silence_threads()
     try:
         main(hasten(options, quick))
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
     except KeyboardInterrupt:
         fail("stopped", 130)
     except Exception as error:

@@ -35,6 +35,20 @@ def ends(monkeypatch, capsys, script, *words, main=None):
     return stopped.value.code, lines[0]
 
 
+@pytest.mark.parametrize("words", [["--help"], ["--scan", "no.ply"]])
+def test_scripts_end_in_silence_where_nobody_reads(words):
+    """After `| head`, say; what goes to the terminal all the same still does."""
+    given = [sys.executable, "-m", "experiments.shade", *words]
+    kinds = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(given, cwd=ROOT, **kinds) as process:
+        process.stdout.close()
+        said = process.stderr.read()
+    expected = "" if words == ["--help"] else "error: no.ply: no such file"
+    assert said.startswith(expected)
+    assert len(said.splitlines()) == bool(expected)
+    assert process.returncode == (2 if expected else 1)
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
