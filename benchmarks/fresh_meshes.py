@@ -61,11 +61,13 @@ def main(options: Options) -> list[Path]:
             f"{options.wheels}: no wheels in it; --help says how to get some"
         )
     options.out.mkdir(parents=True, exist_ok=True)
-    kept = []
+    kept = list[Path]()
     for folder, names in mesh_files(wheels).items():
         some = list(islice(drawn(names), options.each))
         print(f"{folder}: {len(some)} of {len(names)} meshes")
-        kept += [keep(options.out, name, mesh) for name, mesh in some]
+        for name, mesh in some:
+            kept.append(path := options.out / file_name(name, kept))
+            keep(path, mesh)
     return kept
 
 
@@ -112,16 +114,21 @@ def lot(name: str) -> str:
     return hashlib.sha256(name.encode()).hexdigest()
 
 
-def keep(folder: Path, name: str, mesh: Mesh) -> Path:
-    """Write a mesh of those packages, which have z up, with y up."""
+def file_name(name: str, taken: Sequence[Path]) -> str:
+    """A short name for a file of a package; with its lot where others have it."""
     place = PurePosixPath(name)
-    path = folder / f"{place.parts[0]}_{place.parent.name}_{place.stem}.ply"
+    short = f"{place.parts[0]}_{place.parent.name}_{place.stem}"
+    again = short in [path.stem for path in taken]
+    return f"{short}_{lot(name)[:8]}.ply" if again else f"{short}.ply"
+
+
+def keep(path: Path, mesh: Mesh) -> None:
+    """Write a mesh of those packages, which have z up, with y up."""
     upright = mesh.vertices[:, [0, 2, 1]] * [1, 1, -1]
     with writing(path) as partial:
         trimesh.Trimesh(upright, mesh.faces, process=False).export(
             partial, file_type="ply"
         )
-    return path
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ from ginn_jax.commandline import require, start
 from ginn_jax.compare_networks import Trained
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model
-from ginn_jax.files import writing
+from ginn_jax.files import write_whole
 from ginn_jax.image import as_openness, shade_image
 from ginn_jax.inference import encode_cloud, shade_points
 from ginn_jax.irradiance import light_scene
@@ -113,8 +113,8 @@ def main(options: Options) -> Path:
         shade = shade_occlusion if options.effect == "ao" else shade_light
         values, shown = shade(options, mesh, trained)
         path = options.out / "image.png"
-    keep(options.out / "values.npy", lambda file: np.save(file, values))
-    keep(path, shown)
+    write_whole(options.out / "values.npy", lambda file: np.save(file, values))
+    write_whole(path, shown)
     print(path)
     return path
 
@@ -220,13 +220,6 @@ def told(what: str, call: Callable[..., Made], *given: Any) -> Made:
 def as_png(image: Float[np.ndarray, "H W *C"]) -> Write:
     """Writes an image of values from 0 to 1."""
     return lambda file: imsave(file, image, cmap="gray", vmin=0, vmax=1, format="png")
-
-
-def keep(path: Path, write: Write) -> None:
-    """Let the file be written, whole or not at all."""
-    write(whole := io.BytesIO())
-    with writing(path) as partial_file:
-        partial_file.write_bytes(whole.getvalue())
 
 
 if __name__ == "__main__":

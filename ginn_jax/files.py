@@ -1,9 +1,11 @@
 """Files as they come and go: checked before they are read, written whole or not."""
 
+import io
 import os
-from collections.abc import Container, Iterator
+from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from ginn_jax.errors import InputError
 
@@ -57,6 +59,16 @@ def writing(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, write: Callable[[io.BytesIO], Any]) -> None:
+    """Let `write` make the file in memory, and `writing` put it where it belongs.
+
+    In memory first: NumPy and others do not hear of a disk that is full.
+    """
+    write(whole := io.BytesIO())
+    with writing(path) as partial:
+        partial.write_bytes(whole.getvalue())
 
 
 def unwritable(path: Path, error: OSError) -> str:

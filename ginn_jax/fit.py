@@ -1,6 +1,5 @@
 """The training loop of a run: clouds in, weights out, resumable at any step."""
 
-import io
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -20,7 +19,7 @@ from ginn_jax.checkpoint import (
 )
 from ginn_jax.dataset import ShadedPoints, batch_order, stack_clouds
 from ginn_jax.errors import InputError
-from ginn_jax.files import writing
+from ginn_jax.files import write_whole
 from ginn_jax.limits import Limits, exceeded
 from ginn_jax.lit_clouds import Cloud, channel_of
 from ginn_jax.network import Variables
@@ -159,10 +158,8 @@ def recent_loss(history: Sequence[float], steps: int) -> float:
 
 def save_losses(folder: Path, history: Sequence[float]) -> None:
     """Keep the loss of every step beside the checkpoints."""
-    # In memory first: NumPy does not hear of a disk that is full.
-    np.save(whole := io.BytesIO(), np.asarray(history, np.float32))
-    with writing(folder / "losses.npy") as partial:
-        partial.write_bytes(whole.getvalue())
+    losses = np.asarray(history, np.float32)
+    write_whole(folder / "losses.npy", lambda file: np.save(file, losses))
 
 
 def load_losses(folder: Path, steps: int) -> np.ndarray:

@@ -9,11 +9,7 @@ from jaxtyping import Bool, Float
 from ginn_jax.architecture import Network
 from ginn_jax.camera import Camera, orbit_camera
 from ginn_jax.estimates import ColorEstimate
-from ginn_jax.evaluate import (
-    Image,
-    Model,
-    fill,
-)
+from ginn_jax.evaluate import Image, Model, fill
 from ginn_jax.image import Encoded, shade_image
 from ginn_jax.inference import encode_cloud
 from ginn_jax.limits import Limits
