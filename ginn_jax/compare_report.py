@@ -119,9 +119,10 @@ Relative 2D error over the views of each; "pixels" are in the foreground of one.
 {_by_scene(m["rows"])}
 ## Time and memory
 
-Same pixels, same machine, one method after the other, medians of three calls after a
-first one; compilation, G-buffer and direct light apart, and the samples of the surface:
-{ours["seconds_sampling"]:.2g} s, once for all views of a scene. Memory is what
+Same pixels, same machine, one method after the other: of every view the median of three
+calls after a first one, of those the median. Compilation, G-buffer and direct light are
+left out, and the samples of the surface: {ours["seconds_sampling"]:.2g} s, once for
+all views of a scene. Screen space is plain JAX, which nobody made fast. Memory is what
 methods ask for beside inputs and outputs.
 
 {report.table_of(m["results"], times)}
@@ -129,8 +130,9 @@ f_2D takes {m["share_2d"]:.0%} of our network's time (paper: 60 %).
 
 ## Error against run time
 
-Over the first view of every scene.{denoiser} Codes kept: the time of another view of
-the same scene in the same light, f_2D alone.
+Over the first view of every scene, times as above.{denoiser} Where one path takes
+longer than a network, tracing's MSE "at equal time" is that of one path. Codes kept:
+the time of another view of the same scene in the same light, f_2D alone.
 
 {report.table_of(rows, against | report.TRACING)}
 Pareto front by 2D MSE: {", ".join(m["front_mse"])}.

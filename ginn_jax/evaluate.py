@@ -235,7 +235,8 @@ def ray_row(view: View, radius: float, rays: int, seed: int) -> Row:
 
 
 def mean_rows(rows: Sequence[Row]) -> list[Row]:
-    """Means over the shots of each method; relative errors as ratios of means."""
+    """Means over the shots of each method; relative errors as ratios of means. Times
+    are medians: in one shot the machine may have had other work."""
     methods: dict[str, list[Row]] = {}
     for row in rows:
         methods.setdefault(row["method"], []).append(row)
@@ -244,7 +245,8 @@ def mean_rows(rows: Sequence[Row]) -> list[Row]:
         numbers = [
             k for k, v in group[0].items() if isinstance(v, int | float | np.number)
         ]
-        mean = {k: float(np.mean([row[k] for row in group])) for k in numbers}
+        middle = {k: np.median if k.startswith("seconds") else np.mean for k in numbers}
+        mean = {k: float(middle[k]([row[k] for row in group])) for k in numbers}
         if "variance_2d" in mean:
             relative = relative_error(mean["mse_2d"], mean["variance_2d"])
             mean["relative_mse_2d"] = relative

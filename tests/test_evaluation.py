@@ -181,6 +181,12 @@ def test_rows_that_differ_are_pooled_by_their_means():
     assert [row["mse_2d"] for row in means] == [2, 3]
 
 
+def test_one_shot_in_which_the_machine_had_other_work_makes_no_time():
+    shots = [{"method": "a", "mse_2d": m, "seconds": s} for m, s in ((1, 2), (3, 99))]
+    [pooled] = evaluate.mean_rows([*shots, {"method": "a", "mse_2d": 5, "seconds": 3}])
+    assert (pooled["mse_2d"], pooled["seconds"]) == (3, 3)
+
+
 def test_fronts_are_told_apart():
     """Kept codes and light that is counted have fronts of their own."""
     base = {"variance_2d": 1.0, "dssim_2d": 0.1, "seconds_2d": 0.5}
