@@ -176,10 +176,11 @@ def points_asked(
 def queries_asked(
     network: Network, queries: Oriented, material: Array | None, light: Array | None
 ) -> Asked:
-    """What f_2D is told of the queries themselves."""
+    """What f_2D is told of the queries themselves; of masked ones nothing."""
+    normal = jnp.where(queries.mask[:, None], queries.normal, 0.0)
     if network.asks == "normal":
-        return Asked(queries.normal, None)
-    return points_asked(queries, material, light)
+        return Asked(normal, None)
+    return points_asked(queries._replace(normal=normal), material, light)
 
 
 def numbers_asked(network: Network, material: Any, light: Any) -> tuple[Any, Any]:

@@ -86,10 +86,14 @@ def kernel_inputs(
     """
     real = edges.receiver < receivers.position.shape[0]
     rows = jnp.where(real, edges.receiver, 0), edges.sender
-    ends = tuple(
-        jnp.concatenate([p.position, p.normal], axis=1) for p in (receivers, senders)
-    )
+    ends = map(_both, (receivers, senders))
     return _inputs_in_tiles(oriented, *ends, radius, *rows, edges.demand.edges)
+
+
+def _both(points: Oriented) -> Float[Array, "N 6"]:
+    """Positions and normals, zero where masked: what is there has no gradient."""
+    both = jnp.concatenate([points.position, points.normal], axis=1)
+    return jnp.where(points.mask[:, None], both, 0.0)
 
 
 def pair_inputs(oriented: bool, x: Any, y: Any, radius: Any) -> list[Any]:
@@ -175,6 +179,7 @@ def point_area(
     over a flat surface is pi r^2 / 3. The density is of the edges that are `counted`
     and no longer than the radius.
     """
+    position = jnp.where(mask[:, None], position, 0.0)
     value = jnp.maximum(1 - squared_lengths(position, edges) / radius**2, 0.0) ** 2
     real = edges.receiver < position.shape[0]
     real = real if counted is None else real & counted

@@ -115,3 +115,32 @@ def test_area_of_a_flat_square():
     np.testing.assert_allclose(np.asarray(area)[inside], 1 / side**2, rtol=0.1)
     middle = (np.abs(place - 0.5) < 0.25).all(axis=1)
     assert np.asarray(area)[middle].sum() == pytest.approx(0.25, rel=0.02)
+
+
+@pytest.mark.parametrize("masked", [0, -1])
+def test_whatever_is_masked_has_no_gradient(masked):
+    """Padded edges name the first row, and the last one may be read beyond the end."""
+    rng = np.random.default_rng(5)
+    mask = np.ones(12, bool)
+    mask[masked] = False
+    radius = jnp.float32(0.7)
+
+    def total(position, normal, radius):
+        points = rf.Oriented(position, normal, jnp.asarray(mask))
+        grid = build_grid(position, points.mask, radius)
+        limit = EdgeLimit(256, 256, 64, 256)
+        edges = radius_edges(grid, position, points.mask, radius, limit)
+        area = rf.point_area(position, points.mask, edges, radius)
+        inputs = rf.kernel_inputs(points, points, edges, radius, True)
+        weight = rf.surface_weight(area, edges, 12, radius)
+        return jnp.sum(inputs * weight)
+
+    slopes = jax.jit(jax.grad(total, argnums=(0, 1, 2)))
+    ends = [rng.uniform(0, 1, (12, 3)).astype(np.float32) for _ in range(2)]
+    garbage = [np.where(mask[:, None], end, np.float32(np.nan)) for end in ends]
+    clean = [np.where(mask[:, None], end, np.float32(0)) for end in ends]
+    wanted, found = slopes(*clean, radius), slopes(*garbage, radius)
+    for right, mine in zip(wanted, found, strict=True):
+        np.testing.assert_array_equal(right, mine)
+    assert not found[0][masked].any()
+    assert np.abs(found[0]).max() > 0.1
