@@ -46,11 +46,8 @@ def evaluate_lit_clouds(
     targets = settings.targets or count_asked(settings.points)
     for name, cloud in zip(names, clouds, strict=True):
         given, asked = split_points(cloud, len(cloud.position) - targets)
-        encoded, limits = encode_lit(network, limits, model, given)
-        numbers = network_numbers(asked, channels_of(encoded))
-        ends = model.variables, encoded, asked.position, asked.normal
-        values, limits = shade_points(network, limits, *ends, *numbers)
-        errors = unit_errors(encoded, asked, np.maximum(values, 0.0))
+        values, encoded, limits = values_at(network, limits, model, given, asked)
+        errors = unit_errors(np.asarray(encoded.scale), asked, values)
         rows.append({"name": name, "points": int(np.sum(encoded.points.mask))} | errors)
         rows[-1]["ray_variance"] = rows[-1]["noise_floor_3d"] * settings.paths
         medium = zip(("extinction", "ior"), cloud.medium.tolist(), strict=False)
@@ -58,11 +55,22 @@ def evaluate_lit_clouds(
     return rows, limits
 
 
+def values_at(
+    network: Network, limits: Limits, model: Model, given: LitCloud, asked: LitCloud
+) -> tuple[Float[np.ndarray, "N C"], Encoded, Limits]:
+    """What a network that is given a cloud says of other points; its codes; the limits
+    that sufficed."""
+    encoded, limits = encode_lit(network, limits, model, given)
+    numbers = network_numbers(asked, channels_of(encoded))
+    ends = model.variables, encoded, asked.position, asked.normal
+    values, limits = shade_points(network, limits, *ends, *numbers)
+    return np.maximum(values, 0.0), encoded, limits
+
+
 def unit_errors(
-    encoded: Encoded, asked: LitCloud, values: Float[np.ndarray, "N C"]
+    scale: Float[np.ndarray, "C"], asked: LitCloud, values: Float[np.ndarray, "N C"]
 ) -> Row:
-    """Errors of `values` at points, noise subtracted."""
-    scale = np.asarray(encoded.scale)
+    """Errors of `values` at points, noise subtracted; `scale` as in `in_units`."""
     noise = np.asarray(np.mean(asked.variance, axis=0, dtype=np.float64))
     error = np.mean((values.astype(np.float64) - asked.target) ** 2, axis=0) - noise
     spread = np.asarray(np.var(asked.target, axis=0, dtype=np.float64) - noise)

@@ -16,7 +16,6 @@ from ginn_jax import blocks, evaluate, evaluate_light, lit_views, presets, train
 from ginn_jax.errors import InputError
 from ginn_jax.lit_clouds import LitCloud
 from ginn_jax.lit_options import LitOptions, choose_sources
-from ginn_jax.shading import Encoded
 
 SMALL = {
     "shapes": 2,
@@ -191,18 +190,15 @@ def cloud_of(light, seed=0):
 
 def test_errors_are_in_units_of_light_and_free_of_noise():
     light = np.random.default_rng(1).gamma(1.0, size=(20000, 3)).astype(np.float32)
-    encoded = Encoded(None, None, None, None, light.mean(axis=0))  # type: ignore
-    cloud = cloud_of(light)
-    exact = evaluate_light.unit_errors(encoded, cloud, 0.5 * light)
+    units, cloud = light.mean(axis=0), cloud_of(light)
+    exact = evaluate_light.unit_errors(units, cloud, 0.5 * light)
     assert abs(exact["mse_3d"]) < 1e-3
     assert exact["noise_floor_3d"] == pytest.approx(0.01, rel=0.01)
-    wrong = evaluate_light.unit_errors(
-        encoded, cloud, 0.5 * light + 0.2 * light.mean(0)
-    )
+    wrong = evaluate_light.unit_errors(units, cloud, 0.5 * light + 0.2 * units)
     assert wrong["mse_3d"] == pytest.approx(0.04, rel=0.05)
     assert wrong["relative_mse_3d"] == pytest.approx(0.04 / 0.25, rel=0.06)
-    bright = encoded._replace(scale=1e4 * encoded.scale)
-    again = evaluate_light.unit_errors(bright, cloud_of(1e4 * light), 5e3 * light)
+    bright = cloud_of(1e4 * light)
+    again = evaluate_light.unit_errors(1e4 * units, bright, 5e3 * light)
     assert again["mse_3d"] == pytest.approx(exact["mse_3d"], abs=1e-5)
 
 
@@ -220,8 +216,8 @@ def test_clouds_without_light_are_left_out_and_counted():
 def test_unlit_channels_have_no_say():
     light = np.random.default_rng(1).gamma(1.0, size=(2000, 3)).astype(np.float32)
     light[:, 2] = 0
-    encoded = Encoded(None, None, None, None, light.mean(axis=0))  # type: ignore
-    found = evaluate_light.unit_errors(encoded, cloud_of(light), 0.5 * light)
+    units = light.mean(axis=0)
+    found = evaluate_light.unit_errors(units, cloud_of(light), 0.5 * light)
     assert np.isfinite(list(found.values())).all()
     squared, scale = np.array([4.0, 9.0, 0.0]), np.array([2.0, 3.0, 0.0])
     assert evaluate_light.in_units(squared, scale) == 1.0
