@@ -15,6 +15,21 @@ from ginn_jax.compare_report import pareto_front
 from ginn_jax.evaluate import Row
 from ginn_jax.metrics import foreground, tone_map
 
+# The same in every figure; no line where a group's methods are not of one kind.
+STYLES = {
+    "ours": ("tab:blue", "o-"),
+    "ours, fewer samples": ("tab:orange", "o-"),
+    "ours, fewer pixels": ("tab:green", "o-"),
+    "ours, mean of draws": ("tab:red", "o"),
+    "ours, codes kept": ("tab:purple", "o-"),
+    "ours, samples and light counted": ("tab:brown", "o-"),
+    "other runs": ("tab:cyan", "s"),
+    "ablations": ("tab:pink", "s"),
+    "screen space": ("tab:olive", "s"),
+    "traced": ("tab:gray", "^-"),
+    "traced and denoised": ("black", "^-"),
+}
+
 
 def draw_front(path: Path, rows: list[Row], counted: Sequence[Row]) -> None:
     """Error against run time, one line a kind of method; of those with samples and
@@ -43,7 +58,7 @@ def draw_front(path: Path, rows: list[Row], counted: Sequence[Row]) -> None:
         "traced and denoised": [r for r in rows if "denoised" in r],
     }
     kept = {n: [_short(r) for r in group] for n, group in groups.items() if group}
-    report.draw_error_against_time(path, kept)
+    report.draw_error_against_time(path, kept, STYLES)
 
 
 def _short(row: Row) -> Row:

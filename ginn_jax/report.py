@@ -66,8 +66,8 @@ def peak_memory_gib() -> float:
 def write_results(folder: Path, metrics: Mapping[str, Any], report: str) -> None:
     """Write metrics.json and report.md into the folder, making it if need be."""
     folder.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(metrics, indent=1, default=_plain)
-    for name, content in zip(RESULTS, (text + "\n", report), strict=True):
+    text = json.dumps(metrics, indent=1, default=_plain) + "\n"
+    for name, content in zip(RESULTS, (text, report), strict=True):
         with writing(folder / name) as new:
             new.write_text(content)
 
@@ -211,19 +211,22 @@ def draw_strip(
 
 
 def draw_error_against_time(
-    path: Path, groups: Mapping[str, Sequence[Mapping[str, Any]]]
+    path: Path,
+    groups: Mapping[str, Sequence[Mapping[str, Any]]],
+    styles: Mapping[str, tuple[str, str]] | None = None,
 ) -> None:
-    """2D error against time, log-log: one line a group, one labelled dot a method."""
+    """2D error against time, log-log: a group in its color and format of `styles` or
+    that of its turn, a labelled dot a method."""
     figure = Figure(figsize=(8, 5.5), layout="constrained")
     axes, dots = figure.add_subplot(), list[tuple[str, float, float]]()
-    marks = [mark for mark in "os^" for _ in range(10)]  # there are ten colours
-    for mark, (name, rows) in zip(marks, groups.items(), strict=False):
+    for turn, (name, rows) in enumerate(groups.items()):
         ordered = sorted(rows, key=lambda row: row["seconds"])
         seconds = [1e3 * row["seconds"] for row in ordered]
         errors = [max(row["mse_2d"], 1e-7) for row in ordered]
-        axes.plot(seconds, errors, f"{mark}-", label=name)
-        names = [row["method"] for row in ordered]
-        dots += zip(names, seconds, errors, strict=True)
+        color, style = (styles or {}).get(name) or (f"C{turn}", "o-")
+        axes.plot(seconds, errors, style, color=color, label=name)
+        dots += zip([row["method"] for row in ordered], seconds, errors, strict=True)
+    axes.margins(0.09)
     axes.set(xlabel="ms per image", ylabel="2D MSE", xscale="log", yscale="log")
     axes.xaxis.set(
         major_locator=LogLocator(subs=(1, 2, 5)),
