@@ -26,7 +26,7 @@ def real_array(name: str, value: Any) -> np.ndarray:
     return array
 
 
-def _wide(array: np.ndarray) -> np.ndarray:
+def wide(array: np.ndarray) -> np.ndarray:
     """In float64 where squares and bounds do not fit its own type."""
     fits = array.dtype.kind == "f" and array.dtype.itemsize >= 4
     return array if fits else array.astype(np.float64)
@@ -66,10 +66,10 @@ def one_of(name: str, value: Any, known: tuple[str, ...]) -> None:
 
 
 def vector(name: str, value: Any) -> np.ndarray:
-    """Three finite numbers."""
+    """Three numbers that are finite in float32."""
     array = real_array(name, value)
-    if array.shape != (3,) or not np.isfinite(array).all():
-        raise InputError(f"{name} {value} must be three finite numbers")
+    if array.shape != (3,) or not np.all(np.abs(wide(array)) <= LARGEST):
+        raise InputError(f"{name} {value} must be three finite numbers, as float32")
     return array
 
 
@@ -80,8 +80,8 @@ def unit_rows(points: Any, normals: Any, what: str = "points") -> None:
         raise InputError(
             f"{what} {points.shape} and normals {normals.shape} must both be [N, 3]"
         )
-    normals = _wide(normals)
-    if not np.all(np.abs(_wide(points)) <= LARGEST):
+    normals = wide(normals)
+    if not np.all(np.abs(wide(points)) <= LARGEST):
         raise InputError(f"{what} holds non-finite numbers: drop those rows")
     if not np.all(np.abs(np.einsum("ij,ij->i", normals, normals) - 1) < 2e-3):
         raise InputError(
@@ -95,7 +95,7 @@ def numbers_of(
     """So many finite numbers for each of these points, in channels; None for none."""
     if width == 0 and value is not None:
         raise InputError(f"the network takes no {name}: leave it out")
-    array = _wide(real_array(name, () if value is None else value))
+    array = wide(real_array(name, () if value is None else value))
     shape = array.shape
     if width and (len(shape) != 3 or shape[1:] != (rows, width) or not shape[0]):
         raise InputError(f"{name} is {shape}, the network takes [C {rows} {width}]")

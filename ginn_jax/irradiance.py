@@ -51,7 +51,7 @@ def light_scene(mesh: Mesh, albedo: Float[np.ndarray, "K 3"], light: Light) -> L
     a mesh or a light that no renderer can take.
     """
     mesh = check_mesh(mesh)
-    check_light(light)
+    light = check_light(light)
     albedo = real_array("albedo", albedo).astype(np.float64)
     if albedo.ndim != 2 or albedo.shape[1] != 3 or not (albedo >= 0).all():
         raise InputError(f"albedo {albedo.shape} must be [K 3] and not negative")

@@ -6,13 +6,21 @@ Radiance is linear RGB. An environment map is a latitude-longitude image: row 0 
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from ginn_jax import radiance_files
-from ginn_jax.checks import LARGEST, LARGEST_SEED, number, real_array, vector, whole
+from ginn_jax.checks import (
+    LARGEST,
+    LARGEST_SEED,
+    number,
+    real_array,
+    vector,
+    whole,
+    wide,
+)
 from ginn_jax.errors import InputError
 from ginn_jax.files import check_file, files_below
 from ginn_jax.renderer import use_mitsuba
@@ -81,7 +89,10 @@ def load_environment(path: str | Path) -> EnvironmentMap:
 
 
 def make_environment(radiance: Float[np.ndarray, "H W 3"]) -> EnvironmentMap:
-    """A map from its pixels, checked and averaged down to 256 rows by solid angle."""
+    """A map from its pixels, checked and averaged down to 256 rows by solid angle.
+
+    Whole numbers are radiance as they are: divide 8-bit pixels and undo their gamma.
+    """
     radiance = _checked_radiance(radiance)
     if radiance.max() == 0:
         raise InputError("radiance is zero everywhere: the map is empty")
@@ -94,29 +105,33 @@ def make_environment(radiance: Float[np.ndarray, "H W 3"]) -> EnvironmentMap:
     return EnvironmentMap(radiance.astype(np.float32))
 
 
-def check_light(light: Light) -> None:
-    """Raise `InputError` unless this is a light that can be traced; it may be dark."""
+def check_light(light: Light) -> Light:
+    """The light in float32 arrays, whatever type of number it came in.
+
+    Raises `InputError` unless it is one that can be traced; it may be dark.
+    """
     if isinstance(light, EnvironmentMap):
-        _checked_radiance(light.radiance)
-    elif isinstance(light, PointLight):
-        vector("light's position", light.position)
-        if not (vector("light's intensity", light.intensity) >= 0).all():
+        return EnvironmentMap(_checked_radiance(light.radiance))
+    if isinstance(light, PointLight):
+        position = vector("light's position", light.position)
+        intensity = vector("light's intensity", light.intensity)
+        if not (intensity >= 0).all():
             raise InputError(f"light's intensity {light.intensity} is negative")
-    else:
-        kind = type(light).__name__
-        raise InputError(f"light is a {kind}: give an EnvironmentMap or a PointLight")
+        return PointLight(*(a.astype(np.float32) for a in (position, intensity)))
+    kind = type(light).__name__
+    raise InputError(f"light is a {kind}: give an EnvironmentMap or a PointLight")
 
 
-def _checked_radiance(radiance: Float[np.ndarray, "H W 3"]) -> np.ndarray:
-    """The pixels of a map, not negative and finite in float32."""
-    radiance = real_array("radiance", radiance)
+def _checked_radiance(radiance: Any) -> Float[np.ndarray, "H W 3"]:
+    """The pixels of a map in float32, not negative and finite there."""
+    radiance = wide(real_array("radiance", radiance))
     if radiance.ndim != 3 or radiance.shape[-1] != 3 or radiance.size == 0:
         raise InputError(f"an environment map is [H W 3], this is {radiance.shape}")
     if not (np.abs(radiance) <= LARGEST).all():
         raise InputError("radiance is not finite; mend those pixels")
     if radiance.min() < 0:
         raise InputError("radiance is negative; clip it at zero")
-    return radiance
+    return np.ascontiguousarray(radiance, np.float32)
 
 
 def _averaging(

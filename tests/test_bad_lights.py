@@ -69,6 +69,8 @@ TABLE: Table = {
     lighting.make_environment: [
         ((np.full((2, 4, 3), "a"),), "radiance holds <U1"),
         ((np.full((2, 4, 3), 1e39),), "radiance is not finite"),
+        ((np.full((2, 4, 3), INF, np.float16),), "radiance is not finite"),
+        ((np.full((2, 4, 3), 1e-60),), "radiance is zero everywhere"),
         ((np.ones((2, 4)),), r"map is \[H W 3\], this is \(2, 4\)"),
         ((np.ones((4, 8, 4)),), r"map is \[H W 3\], this is \(4, 8, 4\)"),
         ((np.ones((0, 0, 3)),), r"map is \[H W 3\], this is \(0, 0, 3\)"),
@@ -103,6 +105,7 @@ TABLE: Table = {
             "light's intensity .* is negative",
         ),
         ({"light": LAMP._replace(position=np.ones(2))}, "light's position .* three"),
+        ({"light": LAMP._replace(intensity=np.full(3, 1e39))}, "intensity .* finite"),
         ({"vertices": BOX.vertices * NAN}, "8 vertices are not finite"),
         ({"material": BOX.material - 1}, r"a material is outside 0\.\.255"),
     ],

@@ -50,6 +50,16 @@ def test_a_map_of_few_pixels_is_light_as_any_other(shape):
     np.testing.assert_allclose(found, 2 * np.pi, rtol=0.02)
 
 
+@pytest.mark.parametrize("kind", [list, bool, np.uint8, int])
+def test_numbers_of_any_type_are_radiance(kind, unchecked):
+    pixels = np.ones((4, 8, 3))
+    sky = EnvironmentMap(pixels.tolist() if kind is list else pixels.astype(kind))
+    points, normals = sampled(floor(), 50)
+    scene = light_scene(floor(), WHITE, sky)
+    found = direct_irradiance(scene, points, normals, samples=1024, seed=0)
+    np.testing.assert_allclose(found, np.pi, rtol=0.02)
+
+
 def quadrature(light, normal, fine=4):
     """Irradiance of a map whose first and last row lie on the poles, as Mitsuba's do.
 
