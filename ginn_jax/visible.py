@@ -14,7 +14,9 @@ from ginn_jax.reference import Scene, check_cast, count_blocked
 from ginn_jax.samples import Samples, sample_surface
 
 Rows = TypeVar("Rows")
-FAR, PROBE_RAYS = 100.0, 32
+# How far a ray goes to have left the scene, in diagonals of it, and at least.
+DIAGONALS, LEAST_FAR = 2.0, 100.0
+PROBE_RAYS = 32
 # Rays that tell of most samples that light reaches them.
 FEW = 4
 # Samples are looked at in parts of what is wanted, until there are enough.
@@ -90,25 +92,35 @@ def reached_by_light(
     """The first `count` samples, or fewer where there are, from which at least one of
     `PROBE_RAYS` rays leaves the scene."""
     ends = samples.position, samples.normal
-    check_cast(scene, *ends, FAR, PROBE_RAYS, seed)
+    far = out_of(scene)
+    check_cast(scene, *ends, far, PROBE_RAYS, seed)
     found, size = np.zeros(0, np.int64), max(-(-count // PARTS), 1)
     for first in range(0, len(samples.position), size):
         rows = np.arange(first, min(first + size, len(samples.position)))
-        found = np.append(found, rows[is_reached(scene, samples, rows, seed)])
+        found = np.append(found, rows[is_reached(scene, samples, rows, far, seed)])
         if len(found) >= count:
             break
     return found[:count]
 
 
+def out_of(scene: Scene) -> float:
+    """A length that leads out of the scene from anywhere in it."""
+    corners = scene.mesh.vertices.astype(np.float64)
+    return max(LEAST_FAR, DIAGONALS * float(np.linalg.norm(np.ptp(corners, axis=0))))
+
+
 def is_reached(
-    scene: Scene, samples: Samples, rows: Int[np.ndarray, "K"], seed: int
+    scene: Scene, samples: Samples, rows: Int[np.ndarray, "K"], far: float, seed: int
 ) -> Bool[np.ndarray, "K"]:
-    """Whether light reaches these rows: all rays are cast where the first few fail."""
+    """Whether light reaches these rows: all rays are cast where the first few fail.
+
+    `far` is the length of the rays.
+    """
     reached, doubtful = np.zeros(len(rows), bool), np.arange(len(rows))
     for cast in ((0, FEW), (FEW, PROBE_RAYS)):
         some = rows[doubtful]
         ends = samples.position[some], samples.normal[some], some.astype(np.uint32)
-        blocked = count_blocked(scene, *ends, FAR, cast, seed)
+        blocked = count_blocked(scene, *ends, far, cast, seed)
         reached[doubtful] = blocked < cast[1] - cast[0]
         doubtful = np.flatnonzero(~reached)
     return reached

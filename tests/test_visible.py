@@ -58,7 +58,7 @@ def test_few_rays_tell_what_all_would():
     samples = visible.sample_sides(well, 3000, 5, True)
     ends = samples.position, samples.normal
     cast = {"rays": visible.PROBE_RAYS, "seed": 5}
-    sky = ambient_occlusion(scene, *ends, visible.FAR, **cast).mean
+    sky = ambient_occlusion(scene, *ends, visible.out_of(scene), **cast).mean
     wanted = np.flatnonzero(sky > 0)
     assert np.count_nonzero((sky > 0) & (sky < 0.1)) > 100
     assert len(wanted) < len(sky) - 100
@@ -72,9 +72,18 @@ def test_sampling_checks_what_ray_casting_does():
     assert len(visible_samples(build_scene(well), 0, seed=1).position) == 0
     with pytest.raises(InputError, match="seed"):
         visible_samples(build_scene(well), 100, seed=2**40)
-    huge = build_scene(well._replace(vertices=well.vertices * np.float32(1e7)))
+    away = build_scene(well._replace(vertices=well.vertices + np.float32(1e7)))
     with pytest.raises(InputError, match="too short for coordinates"):
-        visible_samples(huge, 100, seed=1)
+        visible_samples(away, 100, seed=1)
+
+
+def test_the_inside_is_dropped_whatever_the_unit_of_length():
+    """Millimetres: from one wall of the inner cube to the next it is 700."""
+    cubes = [trimesh.creation.box((side,) * 3) for side in (1000.0, 700.0)]
+    both = trimesh.util.concatenate(cubes)
+    scene = build_scene(make_mesh(both.vertices, both.faces))
+    found = visible_samples(scene, 500, seed=0).position
+    np.testing.assert_allclose(np.abs(found).max(axis=1), 500, rtol=1e-5)
 
 
 def test_a_scene_that_is_sealed_is_refused(tmp_path):
