@@ -192,10 +192,13 @@ def near_origin(
     if flat.size == 0 or not np.isfinite(flat).all():
         return points
     low, high = flat.min(axis=0), flat.max(axis=0)
+    size = float((high - low).max())
     lost = np.finfo(np.float32).eps * np.abs(flat).max()
-    if not lost > ROUNDED * (high - low).max() > 0:
+    if not lost > ROUNDED * size > 0:
         return points
-    middle = np.round((low + high) / 2)
+    # What is left of the middle is to be no more than the object.
+    unit = min(1.0, 2.0 ** np.ceil(np.log2(size)))
+    middle = np.round((low + high) / (2 * unit)) * unit
     _warn(f"{what}: too far away for single precision; moved by {-middle}")
     return (flat - middle).reshape(points.shape)
 

@@ -73,6 +73,17 @@ def test_what_lies_far_away_keeps_its_shape(tmp_path):
         np.testing.assert_array_equal(gm.near_origin(near, "mesh"), near)
 
 
+def test_what_is_small_and_far_away_keeps_its_shape():
+    """A millionth wide, a hundred thousand away."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=5e-7)
+    there = np.add(ball.vertices, [100_000.5, 7.5, 3.5])
+    with pytest.warns(InputWarning, match="too far away"):
+        moved = gm.near_origin(there, "mesh").astype(np.float32)
+    away = np.linalg.norm(moved.astype(float) - moved.mean(axis=0), axis=1)
+    # float64 has steps of 1.5e-11 there.
+    np.testing.assert_allclose(away, 5e-7, rtol=1e-4)
+
+
 def test_notes_of_the_system_and_points_are_no_meshes(tmp_path):
     box = trimesh.creation.box((1, 1, 1))
     box.export(tmp_path / "box.ply")
