@@ -43,7 +43,7 @@ from ginn_jax.lighting import Light, load_environment, procedural_environment
 from ginn_jax.lit_clouds import mean_light
 from ginn_jax.lit_scenes import light_mesh, lit_points
 from ginn_jax.mesh import Mesh
-from ginn_jax.objects import UNSEEN_SEED
+from ginn_jax.objects import UNSEEN_SEED, tell_apart
 from ginn_jax.scenes import Occlusion, Settings
 
 
@@ -142,19 +142,14 @@ def main(options: Options) -> dict[str, Any]:
 
 
 def choose_sequences(options: Options, ground: bool) -> dict[str, list[Mesh]]:
-    """The frames of every sequence as meshes."""
-    found = (
-        {
-            path.stem: sequences.load_animation(path)
-            for path in sequences.find_animations(options.animation)
-        }
-        if options.animation
-        else {
-            "procedural": sequences.procedural_animation(
-                UNSEEN_SEED + options.seed, options.frames
-            )
-        }
-    )
+    """The frames of every sequence as meshes, each under a name of its own."""
+    if options.animation:
+        paths = sequences.find_animations(options.animation)
+        loaded = map(sequences.load_animation, paths)
+        found = dict(zip(tell_apart(paths), loaded, strict=True))
+    else:
+        seed = UNSEEN_SEED + options.seed
+        found = {"procedural": sequences.procedural_animation(seed, options.frames)}
     return {
         name: sequences.frames_of(animation, options.frames, ground)
         for name, animation in found.items()

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from experiments.animation import Options, choose_sequences
 from ginn_jax import sequences
 from ginn_jax.errors import InputError
 
@@ -181,3 +182,14 @@ def test_a_folder_stands_for_its_animations_sorted(tmp_path):
     assert [path.name for path in found] == ["a.npz", "b.npz", "c.npz"]
     missing = tmp_path / "d.npz"
     assert sequences.find_animations(missing) == [missing]
+
+
+def test_sequences_of_one_file_name_are_all_kept(tmp_path):
+    for scene, scale in (("a", 1), ("b", 3)):
+        (tmp_path / scene).mkdir()
+        wide = DATA.vertices * np.float32([scale, 1, 1])
+        np.savez(tmp_path / scene / "walk", vertices=wide, faces=DATA.faces)
+    options = Options(animation=tmp_path, frames=2)
+    found = choose_sequences(options, ground=True)
+    assert list(found) == ["a_walk", "b_walk"]
+    assert not np.array_equal(*(found[name][0].vertices for name in found))
