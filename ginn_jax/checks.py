@@ -1,7 +1,7 @@
 """What public functions ask of their arguments, once, at the door.
 
-Each raises `InputError` for anything else; those of one argument return it, in the
-type to go on with.
+Each raises `InputError` for anything else; those of one argument, and of points with
+normals, return it, in the type to go on with.
 """
 
 from typing import Any
@@ -73,20 +73,23 @@ def vector(name: str, value: Any) -> np.ndarray:
     return array
 
 
-def unit_rows(points: Any, normals: Any, what: str = "points") -> None:
-    """Points and unit normals that belong together, all [N, 3] and finite."""
+def unit_rows(
+    points: Any, normals: Any, what: str = "points"
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points and unit normals that belong together, all [N, 3] and finite; float32."""
     points, normals = real_array(what, points), real_array("normals", normals)
     if points.ndim != 2 or points.shape[1] != 3 or normals.shape != points.shape:
         raise InputError(
             f"{what} {points.shape} and normals {normals.shape} must both be [N, 3]"
         )
-    normals = wide(normals)
-    if not np.all(np.abs(wide(points)) <= LARGEST):
+    points, normals = wide(points), wide(normals)
+    if not np.all(np.abs(points) <= LARGEST):
         raise InputError(f"{what} holds non-finite numbers: drop those rows")
     if not np.all(np.abs(np.einsum("ij,ij->i", normals, normals) - 1) < 2e-3):
         raise InputError(
             "normals are non-finite or not of unit length: divide them by their length"
         )
+    return points.astype(np.float32, copy=False), normals.astype(np.float32, copy=False)
 
 
 def numbers_of(

@@ -119,7 +119,7 @@ def direct_irradiance(
     Every point looks at the light in `samples` directions, drawn in proportion to its
     radiance from a lattice that is shifted at random; one is enough for a point light.
     """
-    unit_rows(points, normals)
+    points, normals = unit_rows(points, normals)
     check_draws("samples", samples, seed)
     samples = samples if isinstance(scene.light, EnvironmentMap) else 1
     parts = [
@@ -191,7 +191,7 @@ def indirect_irradiance(
     pi times the mean of `paths` cosine-distributed path-traced radiances (paper,
     section "Training Data Generation"); Mitsuba's `path` with hidden emitters.
     """
-    unit_rows(points, normals)
+    points, normals = unit_rows(points, normals)
     check_draws("paths", paths, seed)
     return joined(
         _indirect(scene, *launch, paths, seed)

@@ -110,16 +110,18 @@ def add_ground(mesh: Mesh, half_extent: float = 0.8) -> Mesh:
     The gap keeps a flat base from lying in the same plane: what starts on either would
     be on the wrong side of the other.
 
-    The square is centred at x = z = 0; `half_extent` is half its side.
+    The square is centred at x = z = 0; `half_extent` is half its side. Raises
+    `InputError` for what is no mesh, as `make_mesh` does.
     """
     half_extent = positive("half_extent", half_extent)
-    low, h = mesh.vertices[:, 1].min() - GROUND_GAP, half_extent
+    vertices, faces, material = _checked_arrays(*mesh)
+    low, h = vertices[:, 1].min() - GROUND_GAP, half_extent
     square = [[-h, low, -h], [-h, low, h], [h, low, h], [h, low, -h]]
-    faces = np.array([[0, 1, 2], [0, 2, 3]]) + len(mesh.vertices)
+    two = np.array([[0, 1, 2], [0, 2, 3]]) + len(vertices)
     return Mesh(
-        np.concatenate([mesh.vertices, square]).astype(np.float32),
-        np.concatenate([mesh.faces, faces]).astype(np.int32),
-        np.concatenate([mesh.material, [1, 1]]).astype(np.int32),
+        np.concatenate([vertices, square]).astype(np.float32),
+        np.concatenate([faces, two]).astype(np.int32),
+        np.concatenate([material, [1, 1]]).astype(np.int32),
     )
 
 

@@ -66,7 +66,7 @@ def ambient_occlusion(
     unit vectors of the surface the points lie on. Raises `InputError` on bad input.
     """
     scene = mesh if isinstance(mesh, Scene) else build_scene(mesh)
-    check_cast(scene, points, normals, radius, rays, seed)
+    points, normals = check_cast(scene, points, normals, radius, rays, seed)
     number = np.arange(len(points), dtype=np.uint32)
     blocked = count_blocked(scene, points, normals, number, radius, (0, rays), seed)
     p = 1 - blocked / rays
@@ -219,9 +219,12 @@ def columns(rows: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 n"]:
 
 def check_cast(
     scene: Scene, points: Any, normals: Any, radius: float, rays: int, seed: int
-) -> None:
-    """Raise `InputError` unless such rays can be cast in the scene."""
-    unit_rows(points, normals)
+) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]:
+    """Points and normals in float32 arrays.
+
+    Raises `InputError` unless such rays can be cast from there in the scene.
+    """
+    points, normals = unit_rows(points, normals)
     positive("radius", radius)
     whole("rays", rays, 1, RAYS_PER_LAUNCH)
     whole("seed", seed, 0, LARGEST_SEED)
@@ -231,3 +234,4 @@ def check_cast(
             f"radius {radius:g} is too short for coordinates up to {largest:g}: give "
             f"at least {LEAST_RADIUS * largest:.3g}"
         )
+    return points, normals

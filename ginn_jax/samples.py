@@ -93,10 +93,10 @@ def add_ground_samples(
     """
     half_extent = positive("half_extent", half_extent)
     whole("seed", seed, 0, 2**63 - 1)
-    unit_rows(samples.position, samples.normal)
-    if len(samples.position) < 9:
+    position, normal = unit_rows(samples.position, samples.normal)
+    if len(position) < 9:
         raise InputError("point cloud: fewer than 9 points; give a denser one")
-    distance = KDTree(samples.position).query(samples.position, 9)[0][:, -1]
+    distance = KDTree(position).query(position, 9)[0][:, -1]
     if (spacing := float(np.median(distance))) == 0:
         raise InputError("point cloud: most points coincide; remove the duplicates")
     wanted = 8 / (np.pi * spacing**2) * (2 * half_extent) ** 2
@@ -104,10 +104,10 @@ def add_ground_samples(
         raise InputError(f"half_extent {half_extent} takes {wanted:.1g} points: lower")
     count = round(wanted)
     place = np.random.default_rng(seed).uniform(-half_extent, half_extent, (count, 3))
-    place[:, 1] = samples.position[:, 1].min()
+    place[:, 1] = position[:, 1].min()
     up = np.tile(np.array([0, 1, 0], np.float32), (count, 1))
     return Samples(
-        np.concatenate([samples.position, place.astype(np.float32)]),
-        np.concatenate([samples.normal, up]),
-        np.concatenate([samples.material, np.ones(count, np.int32)]),
+        np.concatenate([position, place.astype(np.float32)]),
+        np.concatenate([normal, up]),
+        np.concatenate([samples.material, np.ones(count, np.int32)]).astype(np.int32),
     )

@@ -72,7 +72,7 @@ def subsurface_exitance(
     `points` lie on faces of material 0, whose `normals` point outward. Raises
     `InputError` on bad input.
     """
-    unit_rows(points, normals)
+    points, normals = unit_rows(points, normals)
     _check_medium(medium, paths, seed)
     if not (scene.mesh.material == 0).any():
         raise InputError("the scene has no face of material 0 to enclose a medium")
