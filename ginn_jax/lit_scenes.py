@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ginn_jax.checks import positive, whole
+from ginn_jax.checks import LARGEST_SEED, positive, whole
 from ginn_jax.errors import InputWarning
-from ginn_jax.estimates import ColorEstimate
+from ginn_jax.estimates import PATHS_PER_LAUNCH, ColorEstimate
 from ginn_jax.irradiance import (
     LitScene,
     direct_irradiance,
@@ -28,7 +28,7 @@ from ginn_jax.reference import build_scene
 from ginn_jax.samples import Samples
 from ginn_jax.slab import single_scattering_albedo
 from ginn_jax.subsurface import Medium, subsurface_exitance
-from ginn_jax.visible import visible_samples
+from ginn_jax.visible import MOST_SAMPLES, visible_samples
 
 # The share of lost walks from which on a mesh is said not to hold its medium.
 MOST_LOST = 0.05
@@ -50,7 +50,7 @@ class Illumination:
     targets: int | None = None
 
     def __post_init__(self) -> None:
-        _check_targets(self)
+        _check_counts(self)
 
 
 @dataclass(frozen=True)
@@ -70,12 +70,15 @@ class Scattering:
     absorption: float = 0.1
 
     def __post_init__(self) -> None:
-        _check_targets(self)
+        _check_counts(self)
         positive("size", self.size)
         positive("absorption", self.absorption)
 
 
-def _check_targets(settings: Illumination | Scattering) -> None:
+def _check_counts(settings: Illumination | Scattering) -> None:
+    whole("points", settings.points, 1, MOST_SAMPLES)
+    whole("paths", settings.paths, 1, PATHS_PER_LAUNCH)
+    whole("looks", settings.looks, 1, PATHS_PER_LAUNCH)
     if settings.targets is not None:
         whole("targets", settings.targets, 1, settings.points)
 
@@ -106,7 +109,8 @@ def light_mesh(
 
 def draw_albedo(seed: int) -> Float[np.ndarray, "2 3"]:
     """Uniform RGB albedos of object and ground."""
-    return np.random.default_rng((seed, 4)).uniform(0, 1, (2, 3)).astype(np.float32)
+    rng = np.random.default_rng((whole("seed", seed, 0, LARGEST_SEED), 4))
+    return rng.uniform(0, 1, (2, 3)).astype(np.float32)
 
 
 def draw_medium(
@@ -117,7 +121,7 @@ def draw_medium(
     The extinction is that at which the mean of the colours absorbs as much as was
     drawn: absorption / (1 - single-scattering albedo), at most `DENSE`.
     """
-    rng = np.random.default_rng((seed, 5))
+    rng = np.random.default_rng((whole("seed", seed, 0, LARGEST_SEED), 5))
     absorption = np.clip(rng.exponential(), 0.1, 5.0) * settings.absorption
     ior = rng.uniform(1.0, 1.5)
     alpha = single_scattering_albedo(albedo, ior)

@@ -11,6 +11,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
+from ginn_jax.checks import LARGEST_SEED, whole
 from ginn_jax.errors import InputError, InputWarning
 from ginn_jax.lighting import (
     Light,
@@ -143,13 +144,14 @@ def load_light(source: Source) -> Light:
         return random_point_light(light.seed)
     if light.path is None:
         return procedural_environment(light.seed)
-    share = np.random.default_rng((source.seed, 2)).random()
+    seed = whole("seed", source.seed, 0, LARGEST_SEED)
+    share = np.random.default_rng((seed, 2)).random()
     return turned(load_environment(light.path), share)
 
 
 def random_point_light(seed: int) -> PointLight:
     """A white light above and beside the object, out of its unit box."""
-    rng = np.random.default_rng((seed, 3))
+    rng = np.random.default_rng((whole("seed", seed, 0, LARGEST_SEED), 3))
     around, up = rng.uniform(0, 2 * np.pi), rng.uniform(0.6, 1.4)
     away = rng.uniform(0.9, 1.6)
     place = away * np.cos(around), up, away * np.sin(around)

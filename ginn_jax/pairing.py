@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ginn_jax.checks import LARGEST_SEED, whole
+from ginn_jax.checks import LARGEST_INDEX, LARGEST_SEED, whole
 from ginn_jax.errors import InputError
 from ginn_jax.objects import LightSource, Source
 
@@ -36,8 +36,10 @@ PAPER_SPLIT = Split((1000, 20), (200, 5), (500, 5), 20_000, 4096)
 def split_apart(items: Sequence[T], counts: Sequence[int], seed: int) -> list[list[T]]:
     """Disjoint random parts of a list, of so many items each.
 
-    Raises `InputError` where there are too few.
+    Raises `InputError` where there are too few, or for a negative count or seed.
     """
+    whole("seed", seed, 0, LARGEST_SEED)
+    counts = [whole("count", count, 0, LARGEST_INDEX) for count in counts]
     if len(items) < sum(counts):
         raise InputError(
             f"a split into {', '.join(map(str, counts))} needs {sum(counts)} objects "
@@ -86,6 +88,7 @@ def mixed(
     lights: Sequence[LightSource], maps: Sequence[LightSource], pairs: int, seed: int
 ) -> list[LightSource]:
     """Lights for so many pairs, those of files among them at random places."""
+    whole("seed", seed, 0, LARGEST_SEED)
     if not maps:
         return list(lights)
     both = [*lights[: max(pairs - len(maps), 0)], *maps]

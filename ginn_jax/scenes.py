@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ginn_jax.checks import positive, whole
 from ginn_jax.dataset import ShadedPoints, load_cloud, save_cloud
 from ginn_jax.errors import InputError, naming
 from ginn_jax.lit_clouds import Cloud, load_lit_cloud, save_lit_cloud
@@ -16,8 +17,8 @@ from ginn_jax.lit_scenes import Illumination, Scattering, lit_cloud
 from ginn_jax.mesh import Mesh
 from ginn_jax.objects import Source, load_object, origin_of
 from ginn_jax.process import end_with_parent
-from ginn_jax.reference import ambient_occlusion, build_scene
-from ginn_jax.visible import visible_samples
+from ginn_jax.reference import RAYS_PER_LAUNCH, ambient_occlusion, build_scene
+from ginn_jax.visible import MOST_SAMPLES, visible_samples
 
 # Bounds what a renderer could leak in one process. Not by `max_tasks_per_child`, with
 # which a pool may wait forever for a process that it does not start (python/cpython
@@ -36,6 +37,11 @@ class Occlusion:
     points: int = 20_000
     rays: int = 64
     radius: float = 0.1
+
+    def __post_init__(self) -> None:
+        whole("points", self.points, 1, MOST_SAMPLES)
+        whole("rays", self.rays, 1, RAYS_PER_LAUNCH)
+        positive("radius", self.radius)
 
 
 Settings = Occlusion | Illumination | Scattering

@@ -11,6 +11,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Int
 
+from ginn_jax.checks import LARGEST_INDEX, whole
 from ginn_jax.errors import InputError
 from ginn_jax.files import files_below
 from ginn_jax.mesh import Mesh, add_ground, fit_unit_box, near_origin
@@ -83,7 +84,11 @@ def load_animation(path: Path) -> Animation:
 
 
 def procedural_animation(seed: int, frames: int) -> Animation:
-    """A procedural shape that sways: it leans over and back and turns a little."""
+    """A procedural shape that sways: it leans over and back and turns a little.
+
+    Raises `InputError` for a negative seed, or less than a frame.
+    """
+    frames = whole("frames", frames, 1, LARGEST_INDEX)
     mesh = fit_unit_box(random_shape(seed, closed=True))
     # Few frames, too, are to differ from the first on.
     phase = 2 * np.pi * (np.arange(frames)[:, None] + 0.15) / frames
@@ -101,9 +106,14 @@ def frames_of(animation: Animation, count: int, ground: bool) -> list[Mesh]:
     """`count` consecutive frames, all in the unit box of the whole animation.
 
     The ground, if any, lies under the lowest vertex of all frames. Closed parts that
-    are inside out in the first frame are turned, as those of a mesh are.
+    are inside out in the first frame are turned, as those of a mesh are. An animation
+    that is shorter gives all it has. Raises `InputError` for one without frames, or
+    whose vertices coincide.
     """
+    count = whole("count", count, 1, LARGEST_INDEX)
     places = animation.vertices
+    if places.size == 0:
+        raise InputError("animation: no frames; give vertices [T V 3], one frame up")
     faces, _ = turn_outward(places[0], animation.faces)
     low, high = places.min(axis=(0, 1)), places.max(axis=(0, 1))
     scale = float((high - low).max())

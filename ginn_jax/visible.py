@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Int
 
+from ginn_jax.checks import LARGEST_INDEX, LARGEST_SEED, whole
 from ginn_jax.errors import InputError
 from ginn_jax.mesh import Mesh
 from ginn_jax.reference import Scene, check_cast, count_blocked
@@ -21,6 +22,8 @@ PROBE_RAYS = 32
 FEW = 4
 # Samples are looked at in parts of what is wanted, until there are enough.
 PARTS = 2
+# All that is ever drawn for so many can be numbered: five times, each twice as many.
+MOST_SAMPLES = LARGEST_INDEX // 40
 OBJECT = 0  # the material of what stands on the ground
 
 
@@ -54,8 +57,11 @@ def draw_reached(
     `draw` is asked for more until there are enough.
 
     Raises:
-        InputError: a scene that is almost all sealed off.
+        InputError: a scene that is almost all sealed off, a count below 0 or of more
+            than can be numbered, or a negative seed.
     """
+    count = whole("count", count, 0, MOST_SAMPLES)
+    whole("seed", seed, 0, LARGEST_SEED)
     drawn = 5 * count // 2
     for _ in range(5):
         rows, samples = draw(drawn)

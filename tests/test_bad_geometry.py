@@ -19,9 +19,21 @@ from refusals import (
     each_row,
 )
 
-from ginn_jax import camera, hierarchy, mesh, neighbors, reference, samples, shapes
+from ginn_jax import (
+    camera,
+    hierarchy,
+    mesh,
+    neighbors,
+    reference,
+    samples,
+    scenes,
+    sequences,
+    shapes,
+    visible,
+)
 
 CLOUD = samples.Samples(POINTS, UP, np.zeros(20, np.int32))
+SHOT = sequences.Animation(BOX.vertices[None], BOX.faces)
 ORIGIN, TARGET = (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
 
 
@@ -40,6 +52,14 @@ def ground(cloud=CLOUD, half_extent=0.8, seed=0):
 def occlusion(**change):
     given = {"mesh": BOX, "points": POINTS, "normals": UP, "radius": 0.1}
     return reference.ambient_occlusion(**(given | {"rays": 4, "seed": 0} | change))
+
+
+def seen(count):
+    return visible.visible_samples(reference.build_scene(BOX), count, 0)
+
+
+def carried(count=5, seed=0):
+    return sequences.carried_samples(BOX, count, seed=seed)
 
 
 def view(**change):
@@ -179,6 +199,28 @@ TABLE: Table = {
         ({"elevation": 90.0}, "elevation 90.0 looks along up: stay inside"),
         ({"distance": -1.0}, "distance -1.0 must be positive"),
         ({"distance": 0.0}, "distance 0.0 must be positive"),
+    ],
+    seen: [
+        ({"count": -5}, "count -5 must be from 0"),
+        ({"count": 1.5}, "count 1.5 must be .* whole"),
+    ],
+    carried: [
+        ({"count": -5}, "count -5 must be from 0"),
+        ({"count": 1.5}, "count 1.5 must be .* whole"),
+        ({"seed": -1}, "seed -1 must be from 0"),
+    ],
+    sequences.procedural_animation: [
+        ((0, 0), "frames 0 must be from 1"),
+        ((0, 1.5), "frames 1.5 must be .* whole"),
+    ],
+    sequences.frames_of: [
+        ((SHOT, -1, True), "count -1 must be from 1"),
+        ((SHOT._replace(vertices=SHOT.vertices[:0]), 1, True), "animation: no frames"),
+    ],
+    scenes.Occlusion: [
+        ({"points": -5}, "points -5 must be from 1"),
+        ({"rays": 0}, "rays 0 must be from 1"),
+        ({"radius": NAN}, "radius nan must be positive"),
     ],
     shapes.random_shape: [((-1,), "seed -1 must be"), ((1.5,), "seed 1.5 must be")],
 }

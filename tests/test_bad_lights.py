@@ -51,6 +51,10 @@ def exitance(points=POINTS, normals=UP, paths=1, seed=0, material=0, **change):
     return subsurface.subsurface_exitance(*ends, paths=paths, seed=seed)
 
 
+def drawn(seed):
+    return lit_scenes.light_mesh(BOX, SKY, lit_scenes.Illumination(), seed=seed)
+
+
 TABLE: Table = {
     lighting.constant_sky: [
         ((-1.0,), "radiance -1.0 must be a number from 0"),
@@ -150,12 +154,34 @@ TABLE: Table = {
         ((np.full(3, 0.5), 0.5), "index of refraction 0.5 must be"),
         ((np.full(3, NAN), 1.3), "albedo .* is not finite"),
     ],
-    lit_scenes.Illumination: [({"targets": 0}, "targets 0 must be from 1 to 20000")],
+    lit_scenes.Illumination: [
+        ({"targets": 0}, "targets 0 must be from 1 to 20000"),
+        ({"points": -5}, "points -5 must be from 1"),
+        ({"paths": 0}, "paths 0 must be from 1"),
+        ({"looks": 1.5}, "looks 1.5 must be .* whole"),
+    ],
+    lit_scenes.draw_albedo: [((-1,), "seed -1 must be from 0")],
+    lit_scenes.draw_medium: [
+        ((GREY[0], -1, lit_scenes.Scattering()), "seed -1 must be from 0"),
+    ],
+    drawn: [((-1,), "seed -1 must be from 0")],
+    objects.random_point_light: [((-1,), "seed -1 must be from 0")],
+    objects.load_light: [
+        (
+            (objects.Source("box", None, -1, objects.LightSource("a", "a.hdr", 0)),),
+            "seed -1 must be from 0",
+        ),
+    ],
     lit_scenes.Scattering: [
         ({"size": NAN}, "size nan must be positive"),
         ({"absorption": 0.0}, "absorption 0.0 must be positive"),
         ({"targets": 30_000}, "targets 30000 must be from 1 to 20000"),
     ],
+    pairing.split_apart: [
+        (([1, 2], [1], -1), "seed -1 must be from 0"),
+        (([1, 2], [-1], 0), "count -1 must be from 0"),
+    ],
+    pairing.mixed: [(([], [1, 2], 2, -1), "seed -1 must be from 0")],
     pairing.pair_up: [
         (([], [], 1), "no lights: give environment maps"),
         (([], objects.point_lights(2, 0), 0), "lights for each object 0 must be"),
