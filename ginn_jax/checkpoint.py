@@ -153,12 +153,13 @@ def _shape_of(leaf: Any) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding)
 
 
-def load_weights(folder: Path) -> tuple[Training, Limits, Variables]:
+def load_weights(folder: str | Path) -> tuple[Training, Limits, Variables]:
     """What a finished run in `folder` trained: its configuration, capacities, weights.
 
     Raises:
         InputError: no run there, no checkpoint yet, or a damaged file.
     """
+    folder = Path(folder)
     path = folder / RECORD
     record = read_record(path, "no run: name the --out of one")
     with damaged(path, "train again"):

@@ -34,13 +34,13 @@ MANIFEST = "manifest.json"
 Record = dict[str, Any]
 
 
-def load_manifest(folder: Path = FOLDER) -> dict[str, Record]:
+def load_manifest(folder: str | Path = FOLDER) -> dict[str, Record]:
     """What there is, by name, and how each came to be.
 
     Raises:
         InputError: a damaged manifest; one that is not there says of none.
     """
-    path = folder / MANIFEST
+    path = Path(folder) / MANIFEST
     if not path.exists():
         return {}
     found = read_record(path, "no manifest")
@@ -50,7 +50,7 @@ def load_manifest(folder: Path = FOLDER) -> dict[str, Record]:
 
 
 def load_pretrained(
-    name: str, folder: Path = FOLDER
+    name: str, folder: str | Path = FOLDER
 ) -> tuple[Training, Limits, Variables]:
     """Configuration, capacities and weights of "ao", "gi", "sss", of finer networks,
     "ao_fine", "sss_fine", and of ablations.
@@ -58,6 +58,7 @@ def load_pretrained(
     Raises:
         InputError: no network of that name, or a damaged file.
     """
+    folder = Path(folder)
     manifest = load_manifest(folder)
     if name not in manifest:
         known = ", ".join(sorted(manifest)) or "none, so install the package again"
@@ -136,12 +137,15 @@ def tree_name(keys: Any) -> str:
     return jax.tree_util.keystr(keys, simple=True, separator="/")
 
 
-def export(run: Path, name: str, more: Record, folder: Path = FOLDER) -> Path:
+def export(
+    run: str | Path, name: str, more: Record, folder: str | Path = FOLDER
+) -> Path:
     """Write the weights of a finished run into `folder`, with a record of the run.
 
     Raises:
         InputError: no finished run there, or one whose records are damaged.
     """
+    run, folder = Path(run), Path(folder)
     _, limits, variables = load_weights(run)
     record = record_of(run, limits) | more
     folder.mkdir(parents=True, exist_ok=True)

@@ -39,12 +39,13 @@ class Carried(NamedTuple):
     behind: Bool[np.ndarray, "N"]
 
 
-def find_animations(path: Path) -> list[Path]:
+def find_animations(path: str | Path) -> list[Path]:
     """The .npz files of a folder and those below it, sorted; or the one file, which
     need not exist.
 
     Raises `InputError` where there is none in the folder.
     """
+    path = Path(path)
     if not path.is_dir():
         return [path]
     found = files_below(path, {".npz"})
@@ -53,7 +54,7 @@ def find_animations(path: Path) -> list[Path]:
     return found
 
 
-def load_animation(path: Path) -> Animation:
+def load_animation(path: str | Path) -> Animation:
     """An animation from an .npz of `vertices` [T V 3] and `faces` [F 3].
 
     Raises:

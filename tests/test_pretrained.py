@@ -12,7 +12,7 @@ import pytest
 import tiny
 
 from experiments import export
-from ginn_jax import checkpoint, fit, presets, pretrained, report, run_record
+from ginn_jax import checkpoint, fit, presets, pretrained, report, run_record, sequences
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model
 
@@ -206,3 +206,14 @@ def test_a_folder_does_not_stand_in_for_a_network_of_the_package(tmp_path, monke
     assert presets.effect_of(config.network) == "gi"
     with pytest.raises(InputError, match="gi holds no run"):
         pretrained.load_network("gi", "./gi")
+
+
+def test_folders_may_be_strings(exported, tmp_path):
+    _, state, run = exported
+    pretrained.export(str(run), "sea", {}, str(tmp_path))
+    for found in (
+        checkpoint.load_weights(str(run)),
+        pretrained.load_pretrained("sea", str(tmp_path)),
+    ):
+        assert tiny.identical(jax.device_get(found[2]), jax.device_get(state.variables))
+    assert sequences.find_animations(str(tmp_path / "a.npz")) == [tmp_path / "a.npz"]
