@@ -4,7 +4,6 @@ Two effects: global illumination, of a diffuse object on diffuse ground, and sub
 scattering, of a translucent object in the air.
 """
 
-import warnings
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ginn_jax.checks import LARGEST_SEED, positive, whole
-from ginn_jax.errors import InputWarning
+from ginn_jax.errors import warn
 from ginn_jax.estimates import PATHS_PER_LAUNCH, ColorEstimate
 from ginn_jax.irradiance import (
     LitScene,
@@ -145,11 +144,9 @@ def transport(
     ends = lit.scene, medium, position, normal
     found, lost = subsurface_exitance(*ends, paths=paths, seed=seed)
     if lost > MOST_LOST:
-        warnings.warn(
+        warn(
             f"{lost:.0%} of the walks in the medium left it by holes of the mesh and "
-            "count as dark: close them",
-            InputWarning,
-            stacklevel=2,
+            "count as dark: close them"
         )
     return found
 

@@ -3,7 +3,6 @@
 Geometry is computed in float64 and returned in float32; units as `fit_unit_box` says.
 """
 
-import warnings
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +13,7 @@ from trimesh.exchange.load import mesh_formats
 
 from ginn_jax import orientation
 from ginn_jax.checks import positive, real_array
-from ginn_jax.errors import InputError, InputWarning, naming
+from ginn_jax.errors import InputError, naming, warn
 from ginn_jax.files import files_below
 from ginn_jax.mesh_files import load_scene, merge
 
@@ -50,10 +49,10 @@ def make_mesh(
     if not solid.any():
         raise InputError("mesh: all faces have zero area; give triangles with an area")
     if dropped := int((~solid).sum()):
-        _warn(f"dropped {dropped} of {len(faces)} faces: they have zero area")
+        warn(f"dropped {dropped} of {len(faces)} faces: they have zero area")
     faces, turned = orientation.turn_outward(vertices, faces[solid])
     if turned:
-        _warn(f"turned {turned} closed part(s) that were inside out")
+        warn(f"turned {turned} closed part(s) that were inside out")
     used, faces = np.unique(faces, return_inverse=True)
     faces = faces.reshape(-1, 3).astype(np.int32)
     return Mesh(vertices[used], faces, material[solid])
@@ -201,7 +200,7 @@ def near_origin(
     # What is left of the middle is to be no more than the object.
     unit = min(1.0, 2.0 ** np.ceil(np.log2(size)))
     middle = np.round((low + high) / (2 * unit)) * unit
-    _warn(f"{what}: too far away for single precision; moved by {-middle}")
+    warn(f"{what}: too far away for single precision; moved by {-middle}")
     return (flat - middle).reshape(points.shape)
 
 
@@ -209,7 +208,3 @@ def area_vectors(corners: Float[np.ndarray, "F 3 3"]) -> Float[np.ndarray, "F 3"
     """Normals whose length is the area of their triangle."""
     edges = corners[:, 1:] - corners[:, :1]
     return np.cross(edges[:, 0], edges[:, 1]) / 2
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, InputWarning, stacklevel=3)

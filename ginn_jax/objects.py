@@ -1,7 +1,6 @@
 """Where objects and lights come from: seeds and files."""
 
 import json
-import warnings
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from ginn_jax.checks import LARGEST_SEED, whole
-from ginn_jax.errors import InputError, InputWarning
+from ginn_jax.errors import InputError, silence
 from ginn_jax.lighting import (
     Light,
     PointLight,
@@ -120,8 +119,7 @@ def load_object(source: Source, ground: bool = True) -> Mesh:
     """`object_or_shape` of a source, without the warnings of files."""
     if source.path is None:
         return object_or_shape(None, shape_seed(source), ground)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)
+    with silence():
         return object_or_shape(Path(source.path), 0, ground)
 
 

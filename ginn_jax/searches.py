@@ -1,12 +1,10 @@
 """Which searches a network makes, and the names of their capacities."""
 
-import warnings
-
 import jax.numpy as jnp
 
 from ginn_jax.architecture import QUERY, Conv, Network, reach
 from ginn_jax.candidates import PACKET
-from ginn_jax.errors import InputWarning
+from ginn_jax.errors import warn
 from ginn_jax.limits import Demands, Limits
 from ginn_jax.packets import Demand, EdgeLimit, Edges, radius_edges
 from ginn_jax.receptive_field import Oriented
@@ -128,10 +126,8 @@ def transposed(network: Network, conv: Conv) -> str | None:
 def warn_of_gaps(conv: Conv, pairs: int, queries: int) -> None:
     """Warn where queries have hardly a point of the cloud but, maybe, themselves."""
     if pairs < 1.5 * queries:
-        warnings.warn(
+        warn(
             f"within {conv.radius:g} of a query lie {pairs / queries:.2g} points of "
             "the cloud on average: fit the object into the unit box "
-            "(mesh.fit_unit_box, samples.fit_unit_box_points), or give more samples",
-            InputWarning,
-            stacklevel=3,
+            "(mesh.fit_unit_box, samples.fit_unit_box_points), or give more samples"
         )

@@ -1,6 +1,7 @@
 """Meshes from files and folders."""
 
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,20 @@ def test_warnings_of_a_file_name_it(tmp_path):
     solid.export(tmp_path / "inverted.ply")
     with pytest.warns(InputWarning, match=r"^.*inverted\.ply: turned 1 closed.*\Z"):
         gm.load_mesh(tmp_path / "inverted.ply")
+
+
+def test_threads_that_load_leave_the_warnings_of_others_alone(tmp_path, recwarn):
+    solid = trimesh.creation.box()
+    solid.invert()
+    paths = [tmp_path / f"{i}.ply" for i in range(40)]
+    for path in paths:
+        solid.export(path)
+    before = list(warnings.filters)
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(gm.load_mesh, paths))
+    assert list(warnings.filters) == before
+    told = sorted(str(w.message).partition(":")[0] for w in recwarn)
+    assert told == sorted(map(str, paths))
 
 
 def test_folders_are_searched_and_sorted(tmp_path):

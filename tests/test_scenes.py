@@ -1,7 +1,6 @@
 import signal
 import subprocess
 import sys
-import warnings
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ import trimesh
 
 from ginn_jax import objects, scenes
 from ginn_jax.dataset import load_cloud
-from ginn_jax.errors import InputError, InputWarning, naming
+from ginn_jax.errors import InputError, InputWarning, naming, warn
 from ginn_jax.reference import build_scene
 from ginn_jax.shapes import random_shape
 from ginn_jax.visible import visible_samples
@@ -240,9 +239,8 @@ def test_what_is_wrong_with_an_object_names_it(sources, tmp_path, monkeypatch):
     monkeypatch.setattr(scenes, "visible_samples", fail)
     with pytest.raises(InputError, match=r"^crate: all is sealed: mend it$"):
         scenes.make_cloud(sources[0], SETTINGS, tmp_path / "cloud.npz")
-    leaks = InputWarning("a tenth leaks")
     with pytest.warns(InputWarning, match="^crate: a tenth"), naming("crate"):
-        warnings.warn(leaks, stacklevel=1)
+        warn("a tenth leaks")
     named = InputError("crate is empty")
     with (
         pytest.raises(InputError, match=r"^crate is empty$"),
