@@ -44,20 +44,22 @@ def enter_screen(
 ) -> Screen:
     """A G-buffer in the coordinates of the camera that rendered it.
 
-    Raises `InputError` where the shapes are not those of one image of that camera.
+    Raises `InputError` where the shapes are not those of one image of that camera, or
+    the mask is not of truth values.
     """
-    shape = (camera.height, camera.width)
-    if jnp.shape(mask) != shape:
+    shape, mask = (camera.height, camera.width), jnp.asarray(mask)
+    if mask.shape != shape:
         raise InputError(
-            f"mask {jnp.shape(mask)} is not of the camera's {shape}: give its G-buffer"
+            f"mask {mask.shape} is not of the camera's {shape}: give its G-buffer"
         )
+    if mask.dtype != bool:
+        raise InputError(f"mask is {mask.dtype}: give bool")
     check_images(shape, position=position, normal=normal)
     axes, origin = view_axes(camera), np.asarray(camera.origin, np.float32)
     focal = camera.height / 2 / float(np.tan(np.radians(camera.vertical_fov) / 2))
     x = (np.arange(camera.width) + 0.5 - camera.width / 2) / focal
     y = (np.arange(camera.height) + 0.5 - camera.height / 2) / focal
     rays = np.stack([*np.meshgrid(x, y), np.ones(shape)], axis=-1).astype(np.float32)
-    mask = jnp.asarray(mask)
     inside = mask[..., None]
     seen = turn(jnp.asarray(position, jnp.float32) - origin, axes)
     # A foreground pixel is in front of the camera, whatever rounding says.

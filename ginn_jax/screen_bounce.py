@@ -18,6 +18,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ginn_jax.camera import Camera
+from ginn_jax.checks import number, positive
 from ginn_jax.screen import (
     Screen,
     check_above_zero,
@@ -56,6 +57,7 @@ def indirect_irradiance(
     """
     check_counts(window=window, samples=samples, marches=marches)
     check_above_zero(thickness=thickness)
+    back = number("back", back, 0.0, 1.0)
     screen = enter_screen(position, normal, mask, camera)
     check_images(screen.mask.shape, exitance=exitance)
     margin = window // 2 + 1
@@ -105,7 +107,8 @@ def bitmask_irradiance(
     that is not seen. Lengths are in units of length; black in the background.
     """
     check_counts(directions=directions, steps=steps)
-    check_above_zero(radius=radius, thickness=thickness)
+    check_above_zero(thickness=thickness)
+    radius, back = positive("radius", radius), number("back", back, 0.0, 1.0)
     check_pairs(directions)
     screen = enter_screen(position, normal, mask, camera)
     check_images(screen.mask.shape, exitance=exitance)

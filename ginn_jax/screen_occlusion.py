@@ -13,6 +13,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ginn_jax.camera import Camera
+from ginn_jax.checks import number, positive
 from ginn_jax.screen import (
     Screen,
     check_above_zero,
@@ -49,7 +50,8 @@ def ambient_occlusion(
     Lengths are in units of length, `bias` in radii; background is open (1).
     """
     check_counts(directions=directions, steps=steps)
-    check_above_zero(radius=radius, thickness=thickness)
+    check_above_zero(thickness=thickness)
+    radius, bias = positive("radius", radius), number("bias", bias, 0.0)
     screen = enter_screen(position, normal, mask, camera)
     table = inverse_depths(screen)
     turns = jnp.array(rotation_pattern(screen.mask.shape))
@@ -91,7 +93,8 @@ def bitmask_occlusion(
     Jimenez et al. 2016. Lengths are in units of length; background is open (1).
     """
     check_counts(directions=directions, steps=steps)
-    check_above_zero(radius=radius, thickness=thickness)
+    check_above_zero(thickness=thickness)
+    radius = positive("radius", radius)
     check_pairs(directions)
     screen = enter_screen(position, normal, mask, camera)
     sweep = Sweep(radius, thickness, directions // 2, steps, 1.0, 0.0, joined=False)

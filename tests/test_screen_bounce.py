@@ -198,7 +198,17 @@ def test_bad_arguments_of_the_window_are_refused(options):
         bounced(indirect_irradiance, scene, sent(scene, 1), options)
 
 
-@pytest.mark.parametrize("options", [{"directions": 3}, {"steps": 0}, {"radius": 0.0}])
+@METHODS
+@pytest.mark.parametrize("back", [np.nan, -0.1, 1.5])
+def test_a_back_that_sends_no_share_is_refused(method, options, back):
+    scene = seen.corner(8)
+    with pytest.raises(InputError, match="back"):
+        bounced(method, scene, sent(scene, 1), options | {"back": back})
+
+
+@pytest.mark.parametrize(
+    "options", [{"directions": 3}, {"steps": 0}, {"radius": 0.0}, {"radius": np.inf}]
+)
 def test_bad_arguments_of_the_bitmask_are_refused(options):
     scene = seen.corner(8)
     with pytest.raises(InputError):

@@ -123,6 +123,7 @@ def test_the_same_image_gives_the_same_under_jit(method):
     [
         {"radius": 0.0},
         {"radius": "a"},
+        {"radius": np.inf},
         {"steps": 0},
         {"steps": 2.5},
         {"directions": 0},
@@ -133,6 +134,21 @@ def test_bad_arguments_are_refused(method, options, unchecked):
     scene = seen.corner(8)
     with pytest.raises(InputError):
         method(*scene.surface, scene.camera, **({"radius": 0.1} | options))
+
+
+@pytest.mark.parametrize("bias", [np.nan, np.inf, -0.1])
+def test_a_bias_that_is_none_is_refused(bias):
+    scene = seen.corner(8)
+    with pytest.raises(InputError, match="bias"):
+        ambient_occlusion(*scene.surface, scene.camera, 0.1, bias=bias)
+
+
+@METHODS
+@pytest.mark.parametrize("kind", [np.float32, np.int32])
+def test_a_mask_of_numbers_is_refused(method, kind, unchecked):
+    position, normal, mask = seen.corner(8).surface
+    with pytest.raises(InputError, match=r"mask is (float|int)32: give bool"):
+        method(position, normal, mask.astype(kind), seen.corner(8).camera, 0.1)
 
 
 @METHODS
