@@ -5,10 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from ginn_jax.checks import LARGEST, number, positive, vector, whole
+from ginn_jax.checks import LARGEST, MOST_PIXELS, number, positive, vector, whole
 from ginn_jax.errors import InputError
-
-MOST_PIXELS = 2**28
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from ginn_jax.errors import InputError
 
 LARGEST_SEED = 2**32 - 1
 LARGEST_INDEX = 2**31 - 1
+MOST_PIXELS = 2**28  # of an image, one that is read or one to be made
 LARGEST = float(np.finfo(np.float32).max)
 
 

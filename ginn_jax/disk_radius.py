@@ -41,8 +41,10 @@ def limits_at(network: Network, limits: Limits, radius: float) -> Limits:
     A power of the ratio of the radii squared for each. The powers are measured, at
     radii .015, .02 and .03 on 20,000 samples of a procedural shape: points go less than
     with the square, for the samples run out. Beyond `FAR` times as fine or coarse all
-    is as there. A guess: whoever uses it still compares demands.
+    is as there. A guess: whoever uses it still compares demands. Raises `InputError`
+    for a radius that is not positive.
     """
+    radius = positive("Poisson radius", radius)
     ratio = min(max(network.levels[0] / radius, 1 / FAR), FAR)
     growth = ratio**2
     powers = {"columns": 0.65, "candidates": -0.3, "words": -0.3, "edges": -1.0}

@@ -138,6 +138,7 @@ def dssim(a: Image, b: Image, mask: Mask | None = None) -> float:
         raise InputError(f"image {a.shape}: DSSIM needs [H W] or [H W C], 11 pixels up")
     _kept(a - b, mask)  # for its checks
     if mask is not None:
+        mask = np.asarray(mask)
         keep = mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim))
         a, b = np.where(keep, a, 0), np.where(keep, b, 0)
     result: Any = structural_similarity(

@@ -8,9 +8,10 @@ needs (both Mitsuba 3.9.1).
 import re
 import struct
 
+from ginn_jax.checks import MOST_PIXELS
+
 SIZE = re.compile(rb"-Y (\d{1,6}) \+X (\d{1,6})\n")
 WINDOW = re.compile(rb"dataWindow\0box2i\0\x10\0\0\0(.{16})", re.DOTALL)
-MOST_PIXELS = 2**28
 
 
 def is_sound(content: bytes) -> bool:

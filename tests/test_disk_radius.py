@@ -89,6 +89,12 @@ def test_beyond_what_was_measured_limits_stay(radius):
     assert farthest.of("conv_0.edges") > 4 * 4096
 
 
+@pytest.mark.parametrize("radius", [0.0, -0.1, np.nan])
+def test_no_limits_are_of_no_radius(radius):
+    with pytest.raises(InputError, match=rf"^Poisson radius {radius} must be positive"):
+        limits_at(compact_network(), Limits(()), radius)
+
+
 def test_other_limits_do_not_go_with_the_radius():
     limits = Limits((("level_2.edges", 640), ("conv_1.edges", 4096)))
     assert limits_at(compact_network(), limits, 0.01) == limits

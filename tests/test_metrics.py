@@ -60,6 +60,13 @@ def test_masked_dssim_equals_the_definition_on_black_background():
     assert metrics.dssim(a, b, mask) == pytest.approx(expected, abs=1e-9)
 
 
+def test_a_mask_may_be_a_list(unchecked):
+    a, b = np.random.default_rng(3).uniform(size=(2, 12, 13))
+    mask = a > 0.3
+    for metric in (metrics.mse, metrics.dssim):
+        assert metric(a, b, mask.tolist()) == metric(a, b, mask)
+
+
 def test_dssim_averages_channels():
     a, b = noisy_pair((14, 16, 3))
     each = [metrics.dssim(a[..., c], b[..., c]) for c in range(3)]
