@@ -115,9 +115,10 @@ what leaves. What is displayed is (direct + indirect) albedo / pi, or exitance /
 network sees one channel, in units of the mean light of the cloud.
 
 Units: lengths are in units of the longest side of the object's bounding box; the
-object is centred, +y is up, and the ground touches its lowest point. Ambient
-occlusion is openness in [0, 1]: the cosine-weighted fraction of rays that meet
-nothing within the occlusion radius; 1 is open. Offsets of a convolution point from
-sender to receiver, (x - y) / r. Neighbours are strictly closer than the radius.
+object is centred, +y is up, and the ground lies at its lowest point, 1e-4 below that
+of a mesh. Ambient occlusion is openness in [0, 1]: the cosine-weighted fraction of
+rays that meet nothing within the occlusion radius; 1 is open. Offsets of a
+convolution point from sender to receiver, (x - y) / r. Neighbours are strictly closer
+than the radius.
 Arrays are float32 and int32 unless a signature says otherwise.
 """

@@ -111,20 +111,20 @@ def direct_irradiance(
     points: Float[np.ndarray, "N 3"],
     normals: Float[np.ndarray, "N 3"],
     *,
-    samples: int,
+    looks: int,
     seed: int,
 ) -> Float[np.ndarray, "N 3"]:
     """Irradiance that arrives from the light unbounced.
 
-    Every point looks at the light in `samples` directions, drawn in proportion to its
+    Every point looks at the light in `looks` directions, drawn in proportion to its
     radiance from a lattice that is shifted at random; one is enough for a point light.
     """
     points, normals = unit_rows(points, normals)
-    check_draws("samples", samples, seed)
-    samples = samples if isinstance(scene.light, EnvironmentMap) else 1
+    check_draws("looks", looks, seed)
+    looks = looks if isinstance(scene.light, EnvironmentMap) else 1
     parts = [
-        _direct(scene, *launch, samples, seed)
-        for launch in launches(points, normals, samples, PATHS_PER_LAUNCH)
+        _direct(scene, *launch, looks, seed)
+        for launch in launches(points, normals, looks, PATHS_PER_LAUNCH)
     ]
     return np.concatenate([np.zeros((0, 3), np.float32), *parts])
 
@@ -134,14 +134,14 @@ def _direct(
     points: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
     first: int,
-    samples: int,
+    looks: int,
     seed: int,
 ) -> Float[np.ndarray, "n 3"]:
     mi, variant = use_mitsuba()
     import drjit as dr
 
     with mi.variant_context(variant):
-        point, ray, at, normal = lanes(scene.mesh, points, normals, samples)
+        point, ray, at, normal = lanes(scene.mesh, points, normals, looks)
         number = point + dr.opaque(mi.UInt32, first)
         shift = random_pair(number, mi.UInt32(0), dr.opaque(mi.UInt32, seed))
         # In words, whose multiples wrap around and stay exact however many they are.
@@ -150,7 +150,7 @@ def _direct(
             for s, step in zip(shift, LATTICE, strict=True)
         ]
         square = mi.Point2f(*square)
-        receiver = dr.zeros(mi.SurfaceInteraction3f, len(points) * samples)
+        receiver = dr.zeros(mi.SurfaceInteraction3f, len(points) * looks)
         receiver.p, receiver.n = at, normal
         toward, radiance = scene.handle.sample_emitter_direction(
             receiver, square, test_visibility=False
@@ -161,8 +161,8 @@ def _direct(
         arrived = dr.select(above, radiance * cosine, 0)
         dr.eval(arrived, above, cast)
         arrived *= dr.select(_free(scene, cast, above), 1, 0)
-        total = [dr.block_reduce(dr.ReduceOp.Add, c, samples) for c in arrived]
-        return np.stack([c.numpy() for c in total], axis=1) / samples
+        total = [dr.block_reduce(dr.ReduceOp.Add, c, looks) for c in arrived]
+        return np.stack([c.numpy() for c in total], axis=1) / looks
 
 
 def _free(scene: LitScene, cast: Any, asked: Any) -> Any:

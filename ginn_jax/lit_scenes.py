@@ -176,8 +176,6 @@ def lit_samples(lit: Lit, count: int, seed: int) -> Samples:
 def lit_points(lit: Lit, samples: Samples, looks: int, *, seed: int) -> LitCloud:
     """Points of a scene with the direct light on them; their targets are zero."""
     position, normal, material = samples
-    irradiance = direct_irradiance(
-        lit.scene, position, normal, samples=looks, seed=seed
-    )
+    irradiance = direct_irradiance(lit.scene, position, normal, looks=looks, seed=seed)
     light = irradiance, np.zeros_like(irradiance), np.zeros_like(irradiance)
     return LitCloud(position, normal, material, *light, lit.albedo, lit.medium)

@@ -36,7 +36,7 @@ def scene():
 
 
 def direct(**change):
-    given = {"points": POINTS, "normals": UP, "samples": 2, "seed": 0} | change
+    given = {"points": POINTS, "normals": UP, "looks": 2, "seed": 0} | change
     return irradiance.direct_irradiance(scene(), **given)
 
 
@@ -115,10 +115,10 @@ TABLE: Table = {
     ],
     direct: [
         *PLACES,
-        ({"samples": 0}, "samples 0 must be from 1"),
-        ({"samples": -3}, "samples -3 must be from 1"),
-        ({"samples": 1.5}, "samples 1.5 must be"),
-        ({"samples": MOST + 1}, "samples 4194305 must be from 1 to 4194304"),
+        ({"looks": 0}, "looks 0 must be from 1"),
+        ({"looks": -3}, "looks -3 must be from 1"),
+        ({"looks": 1.5}, "looks 1.5 must be"),
+        ({"looks": MOST + 1}, "looks 4194305 must be from 1 to 4194304"),
         ({"seed": -1}, "seed -1 must be"),
         ({"seed": 2**32}, "seed 4294967296 must be from 0 to 4294967295"),
     ],

@@ -34,10 +34,10 @@ def test_open_plane_under_a_constant_sky():
     """The mean is within .1 % of pi L, and no point is 1 % off."""
     scene = light_scene(floor(), WHITE, constant_sky(2.0))
     points, normals = sampled(floor(), 200)
-    found = direct_irradiance(scene, points, normals, samples=1024, seed=0)
+    found = direct_irradiance(scene, points, normals, looks=1024, seed=0)
     np.testing.assert_allclose(found, 2 * np.pi, rtol=0.01)
     np.testing.assert_allclose(found.mean(0), 2 * np.pi, rtol=1e-3)
-    under = direct_irradiance(scene, points, -normals, samples=1024, seed=0)
+    under = direct_irradiance(scene, points, -normals, looks=1024, seed=0)
     np.testing.assert_allclose(under, 2 * np.pi, rtol=0.01)
 
 
@@ -46,7 +46,7 @@ def test_a_map_of_few_pixels_is_light_as_any_other(shape):
     sky = EnvironmentMap(np.full((*shape, 3), 2, np.float32))
     points, normals = sampled(floor(), 50)
     scene = light_scene(floor(), WHITE, sky)
-    found = direct_irradiance(scene, points, normals, samples=1024, seed=0)
+    found = direct_irradiance(scene, points, normals, looks=1024, seed=0)
     np.testing.assert_allclose(found, 2 * np.pi, rtol=0.02)
 
 
@@ -56,7 +56,7 @@ def test_numbers_of_any_type_are_radiance(kind, unchecked):
     sky = EnvironmentMap(pixels.tolist() if kind is list else pixels.astype(kind))
     points, normals = sampled(floor(), 50)
     scene = light_scene(floor(), WHITE, sky)
-    found = direct_irradiance(scene, points, normals, samples=1024, seed=0)
+    found = direct_irradiance(scene, points, normals, looks=1024, seed=0)
     np.testing.assert_allclose(found, np.pi, rtol=0.02)
 
 
@@ -95,7 +95,7 @@ def test_unshadowed_surface_has_the_irradiance_of_the_map(light):
     exact = np.array([quadrature(light, n) for n in normals])
     for samples, rtol in [(1024, 0.05), (65536, 2e-3)]:
         found = direct_irradiance(
-            scene, points, normals.astype(np.float32), samples=samples, seed=0
+            scene, points, normals.astype(np.float32), looks=samples, seed=0
         )
         np.testing.assert_allclose(found, exact, rtol=rtol)
     simple = np.array([irradiance_of(light, n) for n in normals])
@@ -109,7 +109,7 @@ def test_plane_under_a_point_light(place):
     scene = light_scene(floor(2), WHITE, LAMP)
     points = np.insert(place, 1, 0, axis=1)
     found = direct_irradiance(
-        scene, points, np.tile(UP, (8, 1)), samples=1 + len(place), seed=1
+        scene, points, np.tile(UP, (8, 1)), looks=1 + len(place), seed=1
     )
     toward = LAMP.position - points
     distance = np.linalg.norm(toward, axis=1, keepdims=True)
@@ -126,19 +126,19 @@ def test_shadow_of_a_point_light_is_black():
     points = np.stack(np.meshgrid(x, [0], x), axis=-1).reshape(-1, 3)
     points = points.astype(np.float32)
     normals = np.tile(UP, (len(points), 1))
-    found = direct_irradiance(scene, points, normals, samples=1, seed=0)
+    found = direct_irradiance(scene, points, normals, looks=1, seed=0)
     dark = np.abs(points).max(axis=1) < 0.2
     assert 0 < dark.sum() < len(points)
     np.testing.assert_array_equal(found[dark], 0)
     assert found[~dark].min() > 0
-    behind = direct_irradiance(scene, points, -normals, samples=1, seed=0)
+    behind = direct_irradiance(scene, points, -normals, looks=1, seed=0)
     np.testing.assert_array_equal(behind, 0)
 
 
 def test_wall_hides_half_the_sky():
     scene = light_scene(floor_and_wall(100), WHITE, constant_sky())
     points, normals = copies((0.05, 0, 0), 200)
-    found = direct_irradiance(scene, points, normals, samples=256, seed=0)
+    found = direct_irradiance(scene, points, normals, looks=256, seed=0)
     mean, sigma = spread(found)
     assert (sigma < 0.01).all()
     np.testing.assert_allclose(mean, np.pi / 2, atol=4 * sigma.max() + 2e-3)
@@ -150,7 +150,7 @@ def test_two_maps_together_give_both_their_irradiance():
     points, normals = copies((0.2, 0, 0.3), 128)
     scenes = [light_scene(cup(), WHITE, light) for light in (one, two, both)]
     found = [
-        spread(direct_irradiance(s, points, normals, samples=256, seed=i))
+        spread(direct_irradiance(s, points, normals, looks=256, seed=i))
         for i, s in enumerate(scenes)
     ]
     mean, sigma = np.array(found).transpose(1, 0, 2)
@@ -165,7 +165,7 @@ def test_chunks_do_not_matter_for_direct_light(monkeypatch):
 
     def look(count, seed):
         return direct_irradiance(
-            scene, points[:count], normals[:count], samples=16, seed=seed
+            scene, points[:count], normals[:count], looks=16, seed=seed
         )
 
     whole = look(60, 7)

@@ -35,7 +35,7 @@ def test_convex_object_alone_lights_itself_by_nothing(light):
     found = indirect_irradiance(scene, points, normals, paths=16, seed=0)
     np.testing.assert_array_equal(found.mean, 0)
     np.testing.assert_array_equal(found.variance, 0)
-    direct = direct_irradiance(scene, points, normals, samples=4, seed=0)
+    direct = direct_irradiance(scene, points, normals, looks=4, seed=0)
     assert direct.max() > 0
 
 
@@ -54,7 +54,7 @@ def test_white_furnace(mesh):
     """
     scene = light_scene(mesh, WHITE, constant_sky())
     points, normals = sampled(mesh, 200, seed=1)
-    direct = direct_irradiance(scene, points, normals, samples=1024, seed=0)
+    direct = direct_irradiance(scene, points, normals, looks=1024, seed=0)
     bounced = indirect_irradiance(scene, points, normals, paths=1024, seed=0)
     mean, sigma = total(bounced)
     assert (sigma < 0.002 * np.pi).all()
@@ -97,7 +97,7 @@ def test_twice_the_radiance_gives_exactly_twice_the_light(light):
     for each in (light, double):
         scene = light_scene(cup(), WHITE * 0.7, each)
         given = scene, points, normals
-        direct.append(direct_irradiance(*given, samples=16, seed=3))
+        direct.append(direct_irradiance(*given, looks=16, seed=3))
         bounced.append(indirect_irradiance(*given, paths=16, seed=3))
     assert bounced[0].mean.max() > 0
     np.testing.assert_allclose(direct[1], 2 * direct[0], rtol=1e-5)
@@ -122,7 +122,7 @@ def test_swapped_channels_swap_the_light(light):
         light_scene(cup(), albedo[:, ::-1].copy(), other),
     )
     found = [
-        spread(direct_irradiance(s, points, normals, samples=64, seed=4))
+        spread(direct_irradiance(s, points, normals, looks=64, seed=4))
         for s in (one, two)
     ] + [
         total(indirect_irradiance(s, points, normals, paths=64, seed=4))
@@ -187,7 +187,7 @@ def test_sun_in_one_pixel_is_found():
     light = EnvironmentMap(radiance)
     scene = light_scene(floor(), WHITE * 0.5, light)
     points, normals = copies((0, 0, 0), 50)
-    found = direct_irradiance(scene, points, normals, samples=256, seed=0)
+    found = direct_irradiance(scene, points, normals, looks=256, seed=0)
     expected = irradiance_of(light, np.array([0.0, 1.0, 0.0]))
     np.testing.assert_allclose(found.mean(0), expected, rtol=0.02)
     np.testing.assert_allclose(found, expected[None].repeat(50, 0), rtol=0.1)
@@ -236,7 +236,7 @@ def test_each_material_has_its_albedo():
 def test_no_points_and_one_path():
     scene = light_scene(cup(), WHITE, constant_sky())
     nothing = np.zeros((0, 3), np.float32)
-    assert direct_irradiance(scene, nothing, nothing, samples=4, seed=0).shape == (0, 3)
+    assert direct_irradiance(scene, nothing, nothing, looks=4, seed=0).shape == (0, 3)
     found = indirect_irradiance(scene, nothing, nothing, paths=4, seed=0)
     assert found.mean.shape == found.variance.shape == (0, 3)
     points, normals = sampled(cup(), 5)

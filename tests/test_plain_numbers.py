@@ -23,7 +23,7 @@ def occlusion(points, normals):
 
 
 def direct(points, normals):
-    return irradiance.direct_irradiance(lit(), points, normals, samples=4, seed=0)
+    return irradiance.direct_irradiance(lit(), points, normals, looks=4, seed=0)
 
 
 def indirect(points, normals):

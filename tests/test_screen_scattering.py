@@ -163,7 +163,7 @@ def test_light_through_a_sheet_is_missed():
     )
     points = scene.position[front], scene.normal[front]
     light = np.zeros((24, 24, 3), np.float32)
-    light[front] = direct_irradiance(lit, *points, samples=4, seed=0)
+    light[front] = direct_irradiance(lit, *points, looks=4, seed=0)
     medium = Medium(ALBEDO, 20.0, 1.0)
     truth = subsurface_exitance(lit, medium, *points, paths=64, seed=0)[0].mean
     assert truth.mean() > 0.05

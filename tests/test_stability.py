@@ -57,7 +57,7 @@ def test_closed_room_of_high_albedo():
     ends = points.astype(np.float32), -ball.face_normals[face].astype(np.float32)
     lamp = PointLight(np.zeros(3, np.float32), np.ones(3, np.float32))
     scene = irradiance.light_scene(mesh, np.array([[0.5, 0.98, 0.99]]), lamp)
-    direct = irradiance.direct_irradiance(scene, *ends, samples=1, seed=0)
+    direct = irradiance.direct_irradiance(scene, *ends, looks=1, seed=0)
     found = irradiance.indirect_irradiance(scene, *ends, paths=64, seed=0)
     series = np.array([1, 49, 99]) * direct.mean(0)
     np.testing.assert_allclose(found.mean.mean(0), series, rtol=0.03)

@@ -69,7 +69,7 @@ def test_flux_out_is_flux_in_under_uneven_light():
     result, _ = subsurface_exitance(
         scene, medium_of(1, 10.0, 1.3), points, normals, paths=8, seed=2
     )
-    arrives = direct_irradiance(scene, points, normals, samples=1, seed=0)
+    arrives = direct_irradiance(scene, points, normals, looks=1, seed=0)
     enters = (1 - external_reflectance(1.3)) * arrives.astype(float)
     difference = result.mean - enters
     sigma = difference.std(0) / np.sqrt(len(points))
@@ -179,7 +179,7 @@ def test_thin_slab_glows_in_front_when_lit_from_behind():
     points, normals = middle(-0.05, 64)
     scene = scene_of(SLAB, lamp)
     medium = medium_of((0.2, 0.5, 0.9), 30.0, 1.3)
-    assert not direct_irradiance(scene, points, normals, samples=1, seed=0).any()
+    assert not direct_irradiance(scene, points, normals, looks=1, seed=0).any()
     front, _ = subsurface_exitance(scene, medium, points, normals, paths=512, seed=6)
     mean, sigma = total(front)
     assert (mean > 5 * sigma).all()
