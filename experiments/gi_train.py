@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ginn_jax.commandline import start
-from ginn_jax.lit_experiment import run_experiment
+from ginn_jax.lit_experiment import check_lit_run, run_experiment
 from ginn_jax.lit_options import QUICK, LitOptions, Preset
 from ginn_jax.lit_scenes import Illumination
 from ginn_jax.presets import ILLUMINATION
@@ -31,6 +31,7 @@ class Options(LitOptions):
 
 def main(options: Options) -> dict[str, Any]:
     """Run the experiment; returns what metrics.json holds."""
+    check_lit_run(options)
     settings = Illumination(options.points, options.paths)
     network = ILLUMINATION[options.preset]
     return run_experiment(options, settings, network, "Global illumination")

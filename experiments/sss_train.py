@@ -13,7 +13,7 @@ from typing import Any
 
 from ginn_jax.commandline import start
 from ginn_jax.errors import InputError
-from ginn_jax.lit_experiment import run_experiment
+from ginn_jax.lit_experiment import check_lit_run, run_experiment
 from ginn_jax.lit_options import QUICK, LitOptions, Preset
 from ginn_jax.lit_scenes import Scattering
 from ginn_jax.presets import SCATTERING
@@ -40,6 +40,7 @@ class Options(LitOptions):
 
 def main(options: Options) -> dict[str, Any]:
     """Run the experiment; returns what metrics.json holds."""
+    check_lit_run(options)
     if not (options.size > 0 and options.absorption > 0):
         raise InputError("--size and --absorption must be positive")
     settings = Scattering(

@@ -38,6 +38,11 @@ PATH_COUNTS = (1, 4, 16, 64)
 LitSettings = Illumination | Scattering
 
 
+def check_lit_run(options: LitOptions) -> None:
+    """Raise `InputError` for options that cannot be meant, by their flags."""
+    check_run(options, {"paths": 2, "lights": 1})
+
+
 def run_experiment(
     options: LitOptions,
     settings: LitSettings,
@@ -45,7 +50,6 @@ def run_experiment(
     title: str,
 ) -> dict[str, Any]:
     """Data, training, evaluation and report of one effect; what metrics.json holds."""
-    check_run(options, {"paths": 2, "lights": 1})
     network = on_disk(options, network)
     console, clock, begin = Console(), Clock(), time.perf_counter()
     seen, unseen = choose_sources(options)
