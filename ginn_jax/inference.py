@@ -1,7 +1,8 @@
 """f_3D of a cloud once, f_2D at any points: on the host, sizing themselves.
 
 Where a capacity is too small they measure what is needed and try again; the limits that
-sufficed come back for reuse. In lanes neither needs any.
+sufficed come back for reuse. In lanes neither needs any; several threads may call them,
+where one runs at a time.
 """
 
 from functools import partial

@@ -32,7 +32,7 @@ from ginn_jax.lane_fields import (
     smoothed,
 )
 from ginn_jax.lane_rows import feature_widths
-from ginn_jax.lanes import Lane, Lanes, Table, program, sort_points
+from ginn_jax.lanes import Lane, Lanes, Table, in_turn, program, sort_points
 from ginn_jax.neighbors import bucket
 from ginn_jax.network import Code, Variables
 from ginn_jax.receptive_field import Oriented
@@ -52,6 +52,7 @@ def encodes_in_lanes(network: Network) -> bool:
     return simple_enough(network, edge_products(network, widest, 1))
 
 
+@in_turn
 def encode_in_lanes(
     network: Network,
     variables: Variables,

@@ -28,7 +28,15 @@ from ginn_jax.lane_fields import (
     weighed,
 )
 from ginn_jax.lane_layers import Constants, as_constants, dot, from_constants, head
-from ginn_jax.lanes import Lane, Lanes, Table, program, side_by_side, sort_points
+from ginn_jax.lanes import (
+    Lane,
+    Lanes,
+    Table,
+    in_turn,
+    program,
+    side_by_side,
+    sort_points,
+)
 from ginn_jax.network import Variables
 from ginn_jax.receptive_field import Oriented
 from ginn_jax.renderer import use_drjit
@@ -65,6 +73,7 @@ def _products(network: Network) -> int:
     return edge + colours * network.head * row
 
 
+@in_turn
 def shade_in_lanes(
     network: Network,
     variables: Variables,

@@ -9,7 +9,7 @@ import threading
 import tracemalloc
 import weakref
 from collections.abc import Callable, Hashable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -26,9 +26,26 @@ PROGRAMS, NEVER = 512, 1 << 30
 # Seconds that are waited for a thread which may have died.
 PATIENCE = 10.0
 
+# Held while lanes run: all threads share what Dr.Jit traced once, and two that are in
+# it hang or end the process.
+IN_TURN = threading.RLock()
+
 # A number, or a few, in each lane.
 Lane = Any
 Lanes = list[Any]
+Given = ParamSpec("Given")
+Found = TypeVar("Found")
+
+
+def in_turn(function: Callable[Given, Found]) -> Callable[Given, Found]:
+    """The function, run by one thread at a time: the others wait."""
+
+    @functools.wraps(function)
+    def run(*args: Given.args, **kwargs: Given.kwargs) -> Found:
+        with IN_TURN:
+            return function(*args, **kwargs)
+
+    return run
 
 
 @functools.lru_cache(maxsize=PROGRAMS)
