@@ -16,7 +16,7 @@ from ginn_jax.checks import LARGEST, number
 from ginn_jax.dataset import relative_to
 from ginn_jax.errors import InputError
 from ginn_jax.example import numbers_asked
-from ginn_jax.inference import check_queries
+from ginn_jax.given import check_queries
 from ginn_jax.lane_shading import lanes_for, shade_in_lanes
 from ginn_jax.limits import Limits
 from ginn_jax.network import Variables
@@ -123,7 +123,7 @@ def shade_image(
 
     Raises:
         InputError: another resolution scale, arrays of unequal size, a mask that is not
-            of bool, or pixels in it that `shade_points` refuses.
+            of bool, or what `shade_points` refuses.
     """
     check_limits(network, limits)
     check_image(position, normal, mask, background)
@@ -172,7 +172,7 @@ def _shade_pixels(
     else:
         ends = network, encoded.center, surface, numbers
         rows, pixels, coherent = pixels_in_order(*ends)
-        check_queries(network, encoded, *pixels)
+        check_queries(network, variables, encoded, *pixels)
         given: tuple[Any, ...] = encoded, *pixels, coherent
         found, limits = shade_blocks(network, limits, variables, *given)
     values = np.full((mask.size, *found.shape[1:]), background, np.float32)
@@ -197,7 +197,7 @@ def _shade_rows(
 
     def check(rows: Int[np.ndarray, "M"]) -> None:
         taken: list[Any] = [None if a is None else a.take(rows, -2) for a in ends]
-        check_queries(network, encoded, *taken)
+        check_queries(network, variables, encoded, *taken)
 
     try:
         check(rows[:0])  # types and shapes

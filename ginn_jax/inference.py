@@ -19,6 +19,7 @@ from ginn_jax.checks import channels_alike, numbers_of, unit_rows
 from ginn_jax.dataset import center_of, relative_to
 from ginn_jax.errors import InputError
 from ginn_jax.example import numbers_asked
+from ginn_jax.given import check_kept, check_queries, check_weights
 from ginn_jax.lane_encoding import encode_in_lanes, encodes_in_lanes
 from ginn_jax.lane_shading import lanes_for, shade_in_lanes
 from ginn_jax.limits import (
@@ -66,7 +67,7 @@ def encode_cloud(
         InputError: an empty cloud, or one that is not finite; normals that are not of
             unit length; material or light that the network does not take, or in other
             channels than each other; light below 0; `kept_before` of another
-            cloud; or limits of another network.
+            cloud; or limits or weights of another network.
     """
     unit_rows(position, normal, "the cloud")
     if not len(position):
@@ -77,6 +78,7 @@ def encode_cloud(
     check_limits(network, limits)
     rows = bucket(len(position))
     check_kept(kept_before, (len(network.levels), rows))
+    check_weights(network, variables)
     center = center_of(position)
     if encodes_in_lanes(network):
         place, mask = relative_to(center, position), np.ones(len(position), bool)
@@ -115,16 +117,6 @@ def nothing_kept(network: Network, points: int) -> Bool[np.ndarray, "L R"]:
     return np.zeros((len(network.levels), bucket(points)), bool)
 
 
-def check_kept(kept: Any, shape: tuple[int, int]) -> None:
-    """Raise `InputError` unless these are samples kept of a cloud of that shape."""
-    given = np.zeros(shape, bool) if kept is None else np.asarray(kept)
-    if given.shape != shape or given.dtype != bool:
-        raise InputError(
-            f"kept_before is {given.dtype} {given.shape}, not bool {shape}: give what "
-            "the same network kept of as many points"
-        )
-
-
 def cloud_limits(
     network: Network,
     cloud: Oriented,
@@ -159,10 +151,10 @@ def shade_points(
 
     Raises:
         InputError: as `encode_cloud`, but for no points at all, which have no values;
-            or limits of another network.
+            or limits, weights or codes of another network.
     """
     check_limits(network, limits)
-    check_queries(network, encoded, position, normal, material, light)
+    check_queries(network, variables, encoded, position, normal, material, light)
     asked = numbers_asked(network, material, light)
     ends = variables, encoded, position, normal, *asked
     if not lanes_for(network):
@@ -170,19 +162,3 @@ def shade_points(
     shaded = shade_in_lanes(network, *ends)
     warn_of_gaps(network.query, shaded.pairs, len(position))
     return shaded.values, limits
-
-
-def check_queries(
-    network: Network,
-    encoded: Encoded,
-    position: Float[np.ndarray, "M 3"],
-    normal: Float[np.ndarray, "M 3"],
-    material: Float[np.ndarray, "C M A"] | None,
-    light: Float[np.ndarray, "C M L"] | None,
-) -> None:
-    """Raise what `shade_points` does."""
-    unit_rows(position, normal)
-    if network.asks == "all":
-        numbers_of("material", material, network.materials, len(position))
-        numbers_of("light", light, network.lights, len(position), least=0.0)
-        channels_alike(encoded.scale, material, light)

@@ -4,7 +4,9 @@ Each refused in one line that names the argument.
 """
 
 from dataclasses import replace
+from functools import partial
 
+import jax
 import numpy as np
 import tiny
 from refusals import (
@@ -20,7 +22,9 @@ from refusals import (
     each_row,
 )
 
-from ginn_jax import image, inference, metrics, presets
+from ginn_jax import image, inference, metrics, objective, presets
+from ginn_jax.example import blank_example
+from ginn_jax.network import Code
 from ginn_jax.searches import uniform_limits
 from ginn_jax.shading import Encoded
 
@@ -29,20 +33,34 @@ PICTURE = np.ones((12, 12))
 FRAME = {"position": POINTS.reshape(4, 5, 3), "normal": UP.reshape(4, 5, 3)}
 
 
-def encode(network=tiny.NETWORK, limits=tiny.LIMITS, **change):
+def encode(network=tiny.NETWORK, limits=tiny.LIMITS, variables=None, **change):
     """Nothing is computed: what is wrong is said before."""
     given = {"position": POINTS, "normal": UP, "key": KEY} | change
-    return inference.encode_cloud(network, limits, {}, **given)
+    return inference.encode_cloud(network, limits, variables or {}, **given)
 
 
-def shade(network=tiny.NETWORK, **change):
+def shade(network=tiny.NETWORK, variables=None, encoded=None, **change):
     given = {"position": POINTS, "normal": UP} | change
-    return inference.shade_points(network, tiny.LIMITS, {}, None, **given)
+    known = variables or {}, encoded
+    return inference.shade_points(network, tiny.LIMITS, *known, **given)
 
 
-def frame(**change):
+def frame(variables=None, encoded=None, **change):
     given = FRAME | {"mask": np.ones((4, 5), bool)} | change
-    return image.shade_image(tiny.NETWORK, tiny.LIMITS, {}, None, **given)
+    known = variables or {}, encoded
+    return image.shade_image(tiny.NETWORK, tiny.LIMITS, *known, **given)
+
+
+def weights_of(network):
+    example = partial(blank_example, network)
+    init = partial(objective.init_variables, network, key=KEY)
+    return jax.eval_shape(lambda: init(example()))
+
+
+def codes(width, scale=None, around=None):
+    """Of 20 points, with so many free features."""
+    code = Code(np.zeros((20, width), np.float32), None)
+    return Encoded(None, None, None, code, scale, around=around)
 
 
 def training(**change):
@@ -73,6 +91,20 @@ def lit_frame(**change):
 
 LIT = replace(tiny.NETWORK, lights=1)
 MADE = replace(LIT, materials=1)
+OWN, OTHERS = (weights_of(n) for n in (tiny.NETWORK, tiny.ONE_LEVEL))
+OF_OTHERS = [
+    ({}, "the weights are not this network's: give those"),
+    ({"variables": OTHERS}, "the weights are not this network's: give those"),
+]
+CODES = [
+    {"encoded": codes(2)},
+    {"encoded": codes(4, scale=np.ones(1))},
+    {"encoded": codes(4, around=())},
+]
+CODES_OF_OTHERS = [
+    (given | {"variables": OWN}, "the codes are of another network: give")
+    for given in CODES
+]
 OTHER = uniform_limits(presets.RELEASED, 64)
 
 TABLE: Table = {
@@ -110,6 +142,7 @@ TABLE: Table = {
             "light holds non-finite",
         ),
         ({"limits": OTHER}, "the limits lack .*: they are of another network"),
+        *OF_OTHERS,
     ],
     shade: [
         ({"position": POINTS[:, :2]}, r"points \(20, 2\) .* must both be"),
@@ -117,6 +150,8 @@ TABLE: Table = {
         ({"position": POINTS * NAN}, "points holds non-finite"),
         ({"normal": UP * 3}, "normals are .* not of unit length"),
         ({"network": replace(LIT, asks="all")}, "light is .*, the network takes"),
+        *OF_OTHERS,
+        *CODES_OF_OTHERS,
     ],
     lit: [
         (
@@ -141,6 +176,8 @@ TABLE: Table = {
         ({"resolution_scale": NAN}, "resolution scale nan: give"),
         ({"resolution_scale": "half"}, "resolution scale holds <U4: give real"),
         ({"resolution_scale": [0.5]}, r"resolution scale \[0.5\]: give 1 over"),
+        *OF_OTHERS,
+        *CODES_OF_OTHERS,
     ],
     metrics.mse: [
         ((WORDS, WORDS), "holds <U1: give real numbers"),
