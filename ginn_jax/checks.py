@@ -14,6 +14,8 @@ LARGEST_SEED = 2**32 - 1
 LARGEST_INDEX = 2**31 - 1
 MOST_PIXELS = 2**28  # of an image, one that is read or one to be made
 LARGEST = float(np.finfo(np.float32).max)
+# Squares of lengths from 1 / FAR to FAR are normal numbers in float32.
+FAR = 1e18
 
 
 def real_array(name: str, value: Any) -> np.ndarray:
@@ -91,6 +93,12 @@ def unit_rows(
             "normals are non-finite or not of unit length: divide them by their length"
         )
     return points.astype(np.float32, copy=False), normals.astype(np.float32, copy=False)
+
+
+def within_reach(what: str, points: Any) -> None:
+    """Points no coordinate of which is so large that its square is not finite."""
+    if np.abs(points).max(initial=0.0) > FAR:
+        raise InputError(f"{what} holds coordinates beyond {FAR:g}: scale them down")
 
 
 def numbers_of(

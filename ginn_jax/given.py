@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ginn_jax.architecture import Network
-from ginn_jax.checks import channels_alike, numbers_of, unit_rows
+from ginn_jax.checks import channels_alike, numbers_of, unit_rows, within_reach
 from ginn_jax.errors import InputError
 from ginn_jax.example import blank_example
 from ginn_jax.lane_rows import Width, feature_widths
@@ -42,6 +42,7 @@ def check_queries(
 ) -> None:
     """Raise what `shade_points` does."""
     unit_rows(position, normal)
+    within_reach("points", position)
     if network.asks == "all":
         numbers_of("material", material, network.materials, len(position))
         numbers_of("light", light, network.lights, len(position), least=0.0)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Key
 from ginn_jax.architecture import Network
 from ginn_jax.block_shading import searchable, shade_blocks
 from ginn_jax.blocks import everywhere, pad_channels, pad_points
-from ginn_jax.checks import channels_alike, numbers_of, unit_rows
+from ginn_jax.checks import channels_alike, numbers_of, unit_rows, within_reach
 from ginn_jax.dataset import center_of, relative_to
 from ginn_jax.errors import InputError
 from ginn_jax.example import numbers_asked
@@ -64,12 +64,13 @@ def encode_cloud(
     and the picture flickers less.
 
     Raises:
-        InputError: an empty cloud, or one that is not finite; normals that are not of
-            unit length; material or light that the network does not take, or in other
-            channels than each other; light below 0; `kept_before` of another
-            cloud; or limits or weights of another network.
+        InputError: an empty cloud, or one that is not finite or reaches beyond 1e18;
+            normals that are not of unit length; material or light that the network
+            does not take, or in other channels than each other; light below 0;
+            `kept_before` of another cloud; or limits or weights of another network.
     """
     unit_rows(position, normal, "the cloud")
+    within_reach("the cloud", position)
     if not len(position):
         raise InputError("the cloud is empty: sample at least one point")
     numbers_of("material", material, network.materials, len(position))

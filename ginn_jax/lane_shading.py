@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from ginn_jax.architecture import Network
 from ginn_jax.cells import in_line
-from ginn_jax.checks import LARGEST
+from ginn_jax.checks import FAR, LARGEST
 from ginn_jax.lane_fields import (
     Query,
     Sum,
@@ -161,12 +161,15 @@ def _read_query(
     )
 
 
-def _doubtful(dr: Any, query: Query) -> Lane:
+def _doubtful(dr: Any, query: Query, center: Lane) -> Lane:
     """Queries that might be refused: none that should be is not among them."""
     squared = dot(query.normal, query.normal)
     light = [x for lanes in query.light for x in lanes]
-    known = [*query.place, *light, *(x for lanes in query.material for x in lanes)]
+    known = [*light, *(x for lanes in query.material for x in lanes)]
     sound = dr.abs(squared - 1) < 1.9e-3
+    for x, origin in zip(query.place, entries(dr, center, 3), strict=True):
+        # Rounding of x is of its own size or the origin's, which is within FAR.
+        sound &= dr.abs(x + origin) < 0.99 * FAR
     for number in known:
         sound &= dr.abs(number) < LARGEST
     for number in light:
@@ -191,7 +194,7 @@ def _shade(
     """The value of every channel, the number of pairs, and whether to check."""
     params = from_constants(weights)
     query = _read_query(dr, network, lane, asked, units[0])
-    doubtful = _doubtful(dr, query)
+    doubtful = _doubtful(dr, query, units[0])
     if around is not None:
         query = smoothed(dr, network, Table(*around), query)
     kernel, ends = params[network.query.name]["kernel"], query.place + query.normal

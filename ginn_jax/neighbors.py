@@ -17,7 +17,7 @@ from ginn_jax.candidates import (
     packet_candidates,
     packet_columns,
 )
-from ginn_jax.checks import real_array
+from ginn_jax.checks import FAR, real_array, within_reach
 from ginn_jax.errors import InputError
 from ginn_jax.packets import Words, list_bits, packet_words
 from ginn_jax.pairs import Pairs, decide, in_order, join
@@ -30,8 +30,6 @@ WORD_BLOCK = 1 << 16
 MANY = 1 << 17
 # Points that are counted from elsewhere at a time.
 RUN = 1 << 12
-# Squares of lengths from 1 / FAR to FAR are normal numbers in float32.
-FAR = 1e18
 
 
 def find_neighbors(
@@ -120,8 +118,7 @@ def as_points(name: str, points: Any) -> Float[np.ndarray, "N 3"]:
     farthest = max(-points.min(initial=0.0), points.max(initial=0.0))
     if not np.isfinite(farthest):
         raise InputError(f"{name} holds non-finite coordinates: remove those rows")
-    if farthest > FAR:
-        raise InputError(f"{name} holds coordinates beyond {FAR:g}: scale them down")
+    within_reach(name, farthest)
     return points
 
 

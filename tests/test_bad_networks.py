@@ -134,6 +134,10 @@ TABLE: Table = {
         ),
         ({"network": LIT, "light": np.ones((0, 20, 1))}, "light is .0, 20, 1., the"),
         ({"position": POINTS.astype(float) * 1e39}, "the cloud holds non-finite"),
+        (
+            {"position": POINTS.astype(float) * 3e38},
+            r"the cloud .* beyond 1e\+18",
+        ),
         ({"position": HALF * np.float16(INF)}, "the cloud holds non-finite"),
         ({"position": RAGGED}, "the cloud has rows of unequal length"),
         ({"normal": (127 * UP).astype(np.int8)}, "normals are .* not of unit length"),
@@ -148,6 +152,7 @@ TABLE: Table = {
         ({"position": POINTS[:, :2]}, r"points \(20, 2\) .* must both be"),
         ({"position": POINTS[:5]}, r"points \(5, 3\) and normals \(20, 3\)"),
         ({"position": POINTS * NAN}, "points holds non-finite"),
+        ({"position": POINTS * np.float32(1e20)}, r"points .* beyond 1e\+18: scale"),
         ({"normal": UP * 3}, "normals are .* not of unit length"),
         ({"network": replace(LIT, asks="all")}, "light is .*, the network takes"),
         *OF_OTHERS,

@@ -168,6 +168,8 @@ def test_one_bad_pixel_is_refused(change, message):
     given |= {"light": light}
     row = tuple(np.argwhere(MASK)[17])
     bad = {np.inf: message, np.nan: message}
+    if change == "position":
+        bad |= dict.fromkeys([-1.01e18, 1e20], r"points holds coordinates beyond 1e")
     if change == "normal":
         bad[2] = message
     if change == "light":
