@@ -136,6 +136,9 @@ def shade_image(
                 f"{name} {np.shape(given)} does not fit the mask {surface.mask.shape}: "
                 "give [C H W numbers]"
             )
+    if not surface.mask.size:
+        channels = () if encoded.scale is None else np.shape(encoded.scale)
+        return np.zeros((*surface.mask.shape, *channels), np.float32), limits
     shade = partial(_shade_pixels, network, limits, variables, encoded, background)
     if step == 1:
         return shade(surface, numbers)

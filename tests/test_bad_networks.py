@@ -8,6 +8,7 @@ from functools import partial
 
 import jax
 import numpy as np
+import pytest
 import tiny
 from refusals import (
     INF,
@@ -256,6 +257,15 @@ TABLE: Table = {
         ({"seed": -1}, "seed -1 must be from 0"),
     ],
 }
+
+
+@pytest.mark.parametrize("shape", [(0, 4), (4, 0)])
+@pytest.mark.parametrize("scale", [1.0, 0.25])
+def test_image_of_no_pixels_has_none(shape, scale):
+    position, mask = np.zeros((*shape, 3), np.float32), np.ones(shape, bool)
+    given = {"position": position, "normal": position, "mask": mask}
+    given |= {"light": np.zeros((2, *shape, 1), np.float32), "resolution_scale": scale}
+    assert lit_frame(**given)[0].shape == (*shape, 2)
 
 
 @each_row(TABLE)
