@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -94,6 +94,18 @@ def finish(manager: ocp.CheckpointManager) -> None:
     """Wait until all is written; `InputError` where it could not be."""
     with _whole_or_none(manager):
         manager.close()
+
+
+@contextmanager
+def finishing(manager: ocp.CheckpointManager) -> Iterator[None]:
+    """`finish` at the end, also where that is an error, which is then what is said."""
+    try:
+        yield
+    except BaseException:
+        with suppress(InputError):
+            finish(manager)
+        raise
+    finish(manager)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from ginn_jax.checkpoint import (
-    finish,
+    finishing,
     open_manager,
     restore_state,
     save_state,
@@ -92,33 +92,34 @@ def fit(
         seconds[purpose] = seconds.get(purpose, 0.0) + more
     # No record may stand beside another run's checkpoints, wherever this is killed.
     manager = open_manager(folder, fresh=not resume)
-    if not resume:
-        save_run(folder, config, room, extra, seconds)
-    found = latest(manager, config, folder) if resume else None
-    state, history = found or (init_state(config, weights), [])
-    seconds["compile"] += time.perf_counter() - begin
-    compiled = set[Limits]()
-    while (step := int(state.step)) < config.steps:
-        begin = time.perf_counter()
-        state, loss, used, wider = step_with_room(config, room, clouds, state)
-        purpose = "train" if used in compiled else "compile"
-        seconds[purpose] += time.perf_counter() - begin
-        if used is None:
-            more = {n: size for n, size in wider.most.sizes if size > room.most.of(n)}
-            progress(step, loss, f"raised {', '.join(more)}")
-            room, raised = wider, raised | more
-            compiled.clear()
-            forget_programs()
-            continue
-        compiled.add(used)
-        history.append(loss)
-        if (step + 1) % intervals.report == 0:
-            progress(step + 1, recent_loss(history, intervals.report), "")
-        if (step + 1) % intervals.save == 0 or step + 1 == config.steps:
-            save_losses(folder, history)
-            save_run(folder, config, room, extra, seconds, raised)
-            save_state(manager, state)
-    finish(manager)
+    with finishing(manager):
+        if not resume:
+            save_run(folder, config, room, extra, seconds)
+        found = latest(manager, config, folder) if resume else None
+        state, history = found or (init_state(config, weights), [])
+        seconds["compile"] += time.perf_counter() - begin
+        compiled = set[Limits]()
+        while (step := int(state.step)) < config.steps:
+            begin = time.perf_counter()
+            state, loss, used, wider = step_with_room(config, room, clouds, state)
+            purpose = "train" if used in compiled else "compile"
+            seconds[purpose] += time.perf_counter() - begin
+            if used is None:
+                most = wider.most.sizes
+                more = {n: size for n, size in most if size > room.most.of(n)}
+                progress(step, loss, f"raised {', '.join(more)}")
+                room, raised = wider, raised | more
+                compiled.clear()
+                forget_programs()
+                continue
+            compiled.add(used)
+            history.append(loss)
+            if (step + 1) % intervals.report == 0:
+                progress(step + 1, recent_loss(history, intervals.report), "")
+            if (step + 1) % intervals.save == 0 or step + 1 == config.steps:
+                save_losses(folder, history)
+                save_run(folder, config, room, extra, seconds, raised)
+                save_state(manager, state)
     return Fit(state, room.usual, np.array(history, np.float32), seconds, raised)
 
 

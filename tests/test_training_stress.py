@@ -1,6 +1,7 @@
 """Training goes on whatever is in the data, and refuses what it cannot learn from."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -80,6 +81,31 @@ def test_training_on_nothing_is_refused(tmp_path, monkeypatch, radius, sizes, me
     refused = pytest.raises(InputError, match=message)
     with tiny.cheap_compiling(), optax, refused:
         fit.fit(config, clouds, tmp_path, fit.Intervals(), lambda *_: None)
+
+
+@pytest.mark.parametrize("written", [True, False])
+def test_a_run_that_fails_waits_for_what_it_saves(tmp_path, monkeypatch, written):
+    """And says why it failed, not that it could not save."""
+    manager, closed = checkpoint.open_manager(tmp_path), []
+    close = manager.close
+
+    def closing():
+        closed.append(close())
+        if not written:
+            raise ValueError("no space left")
+
+    def fails(*_):
+        raise InputError("step 0 has no points left to ask for")
+
+    monkeypatch.setattr(fit, "training_room", lambda *_: tiny.ONE_LEVEL_ROOM)
+    monkeypatch.setattr(manager, "close", closing)
+    monkeypatch.setattr(fit, "open_manager", lambda *_, **__: manager)
+    monkeypatch.setattr(fit, "init_state", lambda *_: SimpleNamespace(step=0))
+    monkeypatch.setattr(fit, "step_with_room", fails)
+    given = tiny.CONFIG, [tiny.sphere_on_plane(1200, 0)], tmp_path, fit.Intervals()
+    with pytest.raises(InputError, match=r"^step 0 has no points left"):
+        fit.fit(*given, lambda *_: None)
+    assert len(closed) == 1
 
 
 def test_progress_leaves_skipped_steps_out():
