@@ -182,9 +182,8 @@ def compare_scene(
         extra = {"reference": options.reference, "size": size, "azimuth": azimuth}
         path = options.out / "references" / f"{source.name}_{size}_{view}.npz"
         origin = cloud_origin(source, settings) | extra
-        shot = with_reference(
-            shot, settings, options.reference, path, origin, seed=source.seed
-        )
+        known = settings, options.reference, path, origin
+        shot = with_reference(shot, *known, seed=source.seed)
         pictures = screen_pictures(shot, camera, settings, units)
         more, networks = network_pictures(networks, given, shot)
         pictures += more

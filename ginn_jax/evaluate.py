@@ -68,9 +68,8 @@ def evaluate_clouds(
 ) -> tuple[list[Row], Limits]:
     """3D errors of every cloud, one row each. `rays` made the targets.
 
-    The first four fifths of a cloud are the network's input, as in training, and the
-    rest is where it is asked, so no point is both. Noise is subtracted: `mse` is
-    against the expectation.
+    The first four fifths of a cloud are the network's input, as in training, the rest
+    is where it is asked. Noise is subtracted: `mse` is against the expectation.
     """
     rows = []
     for name, cloud in zip(names, clouds, strict=True):
@@ -242,9 +241,8 @@ def mean_rows(rows: Sequence[Row]) -> list[Row]:
         methods.setdefault(row["method"], []).append(row)
     means = []
     for method, group in methods.items():
-        numbers = [
-            k for k, v in group[0].items() if isinstance(v, int | float | np.number)
-        ]
+        kinds = int, float, np.number
+        numbers = [k for k, v in group[0].items() if isinstance(v, kinds)]
         middle = {k: np.median if k.startswith("seconds") else np.mean for k in numbers}
         mean = {k: float(middle[k]([row[k] for row in group])) for k in numbers}
         if "variance_2d" in mean:

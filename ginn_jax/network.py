@@ -110,16 +110,9 @@ class McConv(nn.Module):
             return Code(free, light)
         both = free if light is None else jnp.concatenate([free, light], axis=1)
         kernels = conv.channels * free.shape[1] if conv.mixes else both.shape[1]
-        kernel = self.param(
-            "kernel",
-            lambda key: init_kernel(
-                field.inputs.shape[0],
-                kernels,
-                network.hidden,
-                network.group or kernels,
-                key=key,
-            ),
-        )
+        sizes = kernels, network.hidden, network.group or kernels
+        inputs = field.inputs.shape[0]
+        kernel = self.param("kernel", lambda key: init_kernel(inputs, *sizes, key=key))
         if conv.mixes:
             given = kernel, free, field, receivers, conv.channels
             return Code(mc_conv_mixing(*given), None)
