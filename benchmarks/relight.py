@@ -135,7 +135,8 @@ def from_scratch(
     """A call that shades the pixels from nothing, and limits that hold it."""
 
     def shade(limits: Limits) -> tuple[np.ndarray, Limits]:
-        encoded, limits = encode_lit(network, limits, model, cloud)
+        given = network, limits, model, cloud
+        encoded, limits = encode_lit(*given, merge_grey=True)
         channels = 3 if encoded.scale is None else encoded.scale.size
         material, lit = (a[:channels] for a in network_numbers(pixels))
         ends = model.variables, encoded, pixels.position, pixels.normal

@@ -58,7 +58,8 @@ def _values(
         )
     else:
         assert isinstance(shot, LitView)
-        encoded, limits = encode_lit(network, limits, model, cloud, kept_before)
+        ends = network, limits, model, cloud, kept_before
+        encoded, limits = encode_lit(*ends, merge_grey=True)
         numbers = network_numbers(shot.pixels, channels_of(encoded))
     mask = shot.gbuffer.mask
     pixels = shot.gbuffer.position[mask], shot.gbuffer.normal[mask]

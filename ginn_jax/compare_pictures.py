@@ -164,7 +164,8 @@ def _encode(trained: Trained, cloud: Cloud) -> Encoded:
     """f_3D of a cloud."""
     network, limits, model = trained
     if isinstance(cloud, LitCloud):
-        return lit_views.encode_lit(network, limits, model, cloud)[0]
+        given = network, limits, model, cloud
+        return lit_views.encode_lit(*given, merge_grey=True)[0]
     ends = model.variables, cloud.position, cloud.normal
     return encode_cloud(network, limits, *ends, key=model.key)[0]
 

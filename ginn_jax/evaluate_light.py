@@ -122,12 +122,13 @@ def lit_network_row(
     """Errors and times of the network on one object; its values and codes."""
     seen = pixel_numbers(view)
 
+    def encode(limits: Limits) -> tuple[Encoded, Limits]:
+        return encode_lit(network, limits, model, cloud, merge_grey=True)
+
     def shade(limits: Limits, encoded: Encoded) -> tuple[Image, Limits]:
         return shade_seen(network, limits, model, encoded, view.gbuffer, seen, scale)
 
-    encoded, image, limits, times = timed_network(
-        limits, lambda limits: encode_lit(network, limits, model, cloud), shade
-    )
+    encoded, image, limits, times = timed_network(limits, encode, shade)
     values = np.broadcast_to(image[view.gbuffer.mask], view.pixels.target.shape)
     row = {"method": "network" + at_scale(scale)} | times
     errors = lit_image_errors(view, values, np.asarray(encoded.scale))

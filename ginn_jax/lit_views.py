@@ -87,9 +87,17 @@ def encode_lit(
     model: Model,
     cloud: LitCloud,
     kept_before: Bool[Any, "L R"] | None = None,
+    *,
+    merge_grey: bool = False,
 ) -> tuple[Encoded, Limits]:
-    """f_3D of a cloud; all channels, or one where the light is grey."""
-    numbers = distinct_channels(*network_numbers(cloud))
+    """f_3D of a cloud, in all three channels.
+
+    With `merge_grey` in one where all are the same, as of grey light on grey material:
+    queries are then given only `channels_of` their own, and values have one channel.
+    """
+    numbers = network_numbers(cloud)
+    if merge_grey:
+        numbers = distinct_channels(*numbers)
     ends = model.variables, cloud.position, cloud.normal
     return encode_cloud(network, limits, *ends, *numbers, kept_before, key=model.key)
 

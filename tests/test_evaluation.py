@@ -85,6 +85,24 @@ def test_one_channel_only_where_light_and_things_are_grey():
     assert set(count.values()) == {3}
 
 
+def test_codes_of_grey_things_have_three_channels_unless_merged(monkeypatch):
+    """So that what is asked of them is an image in colour, whatever the light."""
+    pixels, model = lit_shot().pixels, Model({}, jax.random.key(0))
+    grey = {n: np.ones_like(getattr(pixels, n)) for n in ("irradiance", "albedo")}
+
+    blank, channels = Encoded(None, None, None, None, None), []  # type: ignore
+
+    def encoded(*given, **_):
+        channels.append([len(numbers) for numbers in given[5:7]])
+        return blank, tiny.LIMITS
+
+    monkeypatch.setattr(lit_views, "encode_cloud", encoded)
+    given = tiny.NETWORK, tiny.LIMITS, model, pixels._replace(**grey)
+    lit_views.encode_lit(*given)
+    lit_views.encode_lit(*given, merge_grey=True)
+    assert channels == [[3, 3], [1, 1]]
+
+
 def test_screen_space_is_given_what_surfaces_send_out():
     shot = lit_shot()
     pixels, mask = shot.pixels, shot.gbuffer.mask
