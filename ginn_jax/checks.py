@@ -29,8 +29,9 @@ def real_array(name: str, value: Any) -> np.ndarray:
     return array
 
 
-def wide(array: np.ndarray) -> np.ndarray:
-    """In float64 where squares and bounds do not fit its own type."""
+def wide_array(name: str, value: Any) -> np.ndarray:
+    """Real numbers, in float64 where squares and bounds do not fit their own type."""
+    array = real_array(name, value)
     fits = array.dtype.kind == "f" and array.dtype.itemsize >= 4
     return array if fits else array.astype(np.float64)
 
@@ -70,8 +71,8 @@ def one_of(name: str, value: Any, known: tuple[str, ...]) -> None:
 
 def vector(name: str, value: Any) -> np.ndarray:
     """Three numbers that are finite in float32."""
-    array = real_array(name, value)
-    if array.shape != (3,) or not np.all(np.abs(wide(array)) <= LARGEST):
+    array = wide_array(name, value)
+    if array.shape != (3,) or not np.all(np.abs(array) <= LARGEST):
         raise InputError(f"{name} {value} must be three finite numbers, as float32")
     return array
 
@@ -80,12 +81,11 @@ def unit_rows(
     points: Any, normals: Any, what: str = "points"
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points and unit normals that belong together, all [N, 3] and finite; float32."""
-    points, normals = real_array(what, points), real_array("normals", normals)
+    points, normals = wide_array(what, points), wide_array("normals", normals)
     if points.ndim != 2 or points.shape[1] != 3 or normals.shape != points.shape:
         raise InputError(
             f"{what} {points.shape} and normals {normals.shape} must both be [N, 3]"
         )
-    points, normals = wide(points), wide(normals)
     if not np.all(np.abs(points) <= LARGEST):
         raise InputError(f"{what} holds non-finite numbers: drop those rows")
     if not np.all(np.abs(np.einsum("ij,ij->i", normals, normals) - 1) < 2e-3):
@@ -107,7 +107,7 @@ def numbers_of(
     """So many finite numbers for each of these points, in channels; None for none."""
     if width == 0 and value is not None:
         raise InputError(f"the network takes no {name}: leave it out")
-    array = wide(real_array(name, () if value is None else value))
+    array = wide_array(name, () if value is None else value)
     shape = array.shape
     if width and (len(shape) != 3 or shape[1:] != (rows, width) or not shape[0]):
         raise InputError(f"{name} is {shape}, the network takes [C {rows} {width}]")

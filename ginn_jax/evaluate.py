@@ -40,6 +40,7 @@ Row = dict[str, Any]
 Image = Float[np.ndarray, "H W *C"]
 # What a background is that nothing occludes.
 OPEN = 1.0
+NUMBERS = int, float, np.number
 
 
 class Model(NamedTuple):
@@ -207,10 +208,8 @@ def network_row(
     view: View,
     scale: float = 1.0,
 ) -> tuple[Row, Float[np.ndarray, "H W"], Limits]:
-    """Errors and times of the network on one object, its image, the limits it took.
-
-    `scale` is the resolution scale of `shade_image`.
-    """
+    """Errors and times of the network on one object, its image, the limits it took;
+    `scale` is the resolution scale of `shade_image`."""
     pixels = view.gbuffer.position, view.gbuffer.normal, view.gbuffer.mask
     ends = model.variables, cloud.position, cloud.normal
     _, image, limits, times = timed_network(
@@ -220,16 +219,15 @@ def network_row(
             network, limits, model.variables, encoded, *pixels, resolution_scale=scale
         ),
     )
-    radius = network.levels[0]
-    method = f"network, disk {radius:g}" + at_scale(scale)
+    method = f"network, disk {(radius := network.levels[0]):g}" + at_scale(scale)
     row = {"method": method, "disk_radius": radius} | times
     return row | image_errors(view, image), image, limits
 
 
 def ray_row(view: View, radius: float, rays: int, seed: int) -> Row:
     """Error and time of ray-traced ambient occlusion at `rays` per pixel."""
-    truth, seconds = timed(lambda: traced(view, radius, rays, seed=seed))
-    row = {"method": f"{rays} rays", "rays": rays, "seconds": seconds}
+    truth, spent = timed(lambda: traced(view, radius, rays, seed=seed))
+    row = {"method": f"{rays} rays", "rays": rays, "seconds": spent}
     return row | image_errors(view, fill(view.gbuffer.mask, truth.mean, OPEN))
 
 
@@ -241,12 +239,11 @@ def mean_rows(rows: Sequence[Row]) -> list[Row]:
         methods.setdefault(row["method"], []).append(row)
     means = []
     for method, group in methods.items():
-        kinds = int, float, np.number
-        numbers = [k for k, v in group[0].items() if isinstance(v, kinds)]
+        numbers = [k for k, v in group[0].items() if isinstance(v, NUMBERS)]
         middle = {k: np.median if k.startswith("seconds") else np.mean for k in numbers}
         mean = {k: float(middle[k]([row[k] for row in group])) for k in numbers}
         if "variance_2d" in mean:
             relative = relative_error(mean["mse_2d"], mean["variance_2d"])
-            mean["relative_mse_2d"] = relative
+            mean |= {"relative_mse_2d": relative}
         means.append({"method": method, "shots": len(group)} | mean)
     return means

@@ -12,23 +12,14 @@ import numpy as np
 from jaxtyping import Float
 
 from ginn_jax import radiance_files
-from ginn_jax.checks import (
-    LARGEST,
-    LARGEST_SEED,
-    number,
-    real_array,
-    vector,
-    whole,
-    wide,
-)
-from ginn_jax.errors import InputError
+from ginn_jax.checks import LARGEST, LARGEST_SEED, number, vector, whole, wide_array
+from ginn_jax.errors import InputError, naming
 from ginn_jax.files import check_file, files_below
 from ginn_jax.renderer import use_mitsuba
 
 ENDINGS = (".hdr", ".exr", ".pfm")
 HEIGHT = 256
-# Sky models end at the horizon; below it lies ground of this albedo.
-EARTH = 0.3
+EARTH = 0.3  # the albedo of the ground below the horizon, where sky models end
 
 
 class EnvironmentMap(NamedTuple):
@@ -82,10 +73,8 @@ def load_environment(path: str | Path) -> EnvironmentMap:
         except Exception as error:  # its readers raise what they like
             reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
             raise InputError(f"{path}: cannot be read ({reason})") from None
-    try:
+    with naming(str(path)):
         return make_environment(pixels)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def make_environment(radiance: Float[np.ndarray, "H W 3"]) -> EnvironmentMap:
@@ -124,7 +113,7 @@ def check_light(light: Light) -> Light:
 
 def _checked_radiance(radiance: Any) -> Float[np.ndarray, "H W 3"]:
     """The pixels of a map in float32, not negative and finite there."""
-    radiance = wide(real_array("radiance", radiance))
+    radiance = wide_array("radiance", radiance)
     if radiance.ndim != 3 or radiance.shape[-1] != 3 or radiance.size == 0:
         raise InputError(f"an environment map is [H W 3], this is {radiance.shape}")
     if not (np.abs(radiance) <= LARGEST).all():
