@@ -73,6 +73,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     lane_convolutions convolutions of f_3D with the layers between
     lane_encoding     f_3D in lanes, on a CPU
     lane_shading      f_2D in lanes, on a CPU
+    given             whether weights, codes, points and queries are of a network
     inference         f_3D of a cloud once, f_2D at any points, sized by themselves
     image             from a G-buffer to an image
     plans             what no light changes of f_3D and f_2D, and the rest
