@@ -68,7 +68,7 @@ class Options:
     """Directions of the direct light per sample and pixel."""
     resolution: int = 256
     """Side of the images in pixels."""
-    exposures: tuple[float, ...] = (0.4, 0.75, 1.5, 3.0)
+    exposures: tuple[float, ...] = (0.75, 1.5, 3.0, 6.0)
     """Mean irradiances to show their network."""
     densities: tuple[float, ...] = (1.0, 0.3, 0.1, 0.03, 0.01)
     """Units of extinction to show their network of scattering."""
@@ -108,11 +108,11 @@ def main(options: Options) -> dict[str, Any]:
     best = min(seens, key=lambda seen: pooled[named(seen)]["relative_mse_3d"])
     theirs = theirs._replace(seens=(best,))
     shown = spread(list(zip(sources, clouds, strict=True)), options.pictures)
-    images = [
-        row
-        for number, scene in enumerate(shown)
-        for row in pictures(options, theirs, ours, settings, scene, number)
-    ]
+    seen = [picture_of(options, theirs, ours, settings, scene) for scene in shown]
+    images = [row for rows, _ in seen for row in rows]
+    if seen:
+        pictures = [picture for _, picture in seen]
+        compare_figures.draw_methods(options.out / "pictures.png", pictures)
     metrics = {"points": list(pooled.values()), "best": best._asdict()}
     metrics |= {"images": evaluate.mean_rows(images), "each": each}
     metrics |= {"each_image": images} | circumstances(options, begin)
@@ -181,15 +181,14 @@ def summary(name: str, rows: list[Row]) -> Row:
     return pooled | level | {"correlation": together}
 
 
-def pictures(
+def picture_of(
     options: Options,
     theirs: Released,
     ours: Trained,
     settings: Settings,
     scene: tuple[Source, LitCloud],
-    number: int,
-) -> list[Row]:
-    """2D errors of both in an image of a scene, which is drawn."""
+) -> tuple[list[Row], tuple[str, dict[str, np.ndarray]]]:
+    """2D errors of both in an image of a scene, and what it shows of their light."""
     (source, cloud), size = scene, options.resolution
     view = lit_views.lit_view(source, settings, options.image_reference, size)
     given, units = points_given(cloud)
@@ -198,9 +197,7 @@ def pictures(
     rows = [picture.row, {"method": THEIRS} | compare.errors(view, values, units)]
     shown = {"reference": view.pixels.target, OURS: picture.values, THEIRS: values}
     shown = {n: evaluate.fill(view.gbuffer.mask, v) for n, v in shown.items()}
-    path = options.out / f"picture_{number}.png"
-    compare_figures.draw_methods(path, [(source.name, shown)])
-    return [row | {"scene": source.name} for row in rows]
+    return [row | {"scene": source.name} for row in rows], (source.name, shown)
 
 
 def write_report(options: Options, best: Seen, metrics: Row) -> str:
@@ -228,7 +225,9 @@ Images of {options.resolution} x {options.resolution} of
 {options.pictures} of the scenes (reference: {options.image_reference} paths), theirs at
 {named(best).removeprefix(THEIRS + ", ")}:
 
-{report.table_of(metrics["images"], flat)}"""
+{report.table_of(metrics["images"], flat)}
+![transported light alone, reference, ours and theirs](pictures.png)
+"""
 
 
 if __name__ == "__main__":
