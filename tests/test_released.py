@@ -12,7 +12,10 @@ from tensorflow_files import random_tensors, write_checkpoint
 from benchmarks import released, released_network, released_weights
 from benchmarks.released_network import Seen
 from ginn_jax.errors import InputError
+from ginn_jax.limits import Limits
 from ginn_jax.lit_clouds import LitCloud
+from ginn_jax.presets import RELEASED
+from ginn_jax.searches import limit_names
 
 # Blocks of 4 values, and rows and columns of the 1x1 layers.
 CONVS = {"Pool_1": 4, "Conv_2": 4, "Pool_2": 8, "Conv_3": 8, "Pool_3": 16}
@@ -166,10 +169,9 @@ def test_network_computes_what_their_code_says(folder):
     given, asked = lit_cloud(400, 1), lit_cloud(40, 2)
     variables = released_weights.load_released("gi", folder)
     seens = [Seen(1.5), Seen(0.5)]
-    key = jax.random.key(0)
-    limits = released_network.first_limits([given], key=key)
+    sizes = {n: 512 if "points" in n else 1 << 14 for n in limit_names(RELEASED)}
     deep, limits = released_network.encode_released(
-        limits, variables, given, seens, key=key
+        Limits(tuple(sizes.items())), variables, given, seens, key=jax.random.key(0)
     )
     ends = limits, variables, deep, asked, seens
     values, _ = released_network.shade_released("gi", *ends)
