@@ -40,6 +40,7 @@ def pytest_configure(config):
 LONGEST = (
     "pretrained",
     "lit_experiments",
+    "released",
     "relight",
     "training_stress",
     "killed_runs",
