@@ -102,16 +102,16 @@ def main(options: Options) -> dict[str, Any]:
     seens = all_seen(options)
     print("capacities", flush=True)
     limits = first_limits([points_given(c)[0] for c in clouds], key=key)
-    theirs = Released(effect, weights, tuple(seens), limits, key)
+    theirs = Released(effect, weights, seens, limits, key)
     each = errors_at_points(theirs, ours, sources, clouds, settings)
     pooled = {name: summary(name, rows) for name, rows in each.items()}
     best = min(seens, key=lambda seen: pooled[named(seen)]["relative_mse_3d"])
     theirs = theirs._replace(seens=(best,))
     shown = spread(list(zip(sources, clouds, strict=True)), options.pictures)
-    seen = [picture_of(options, theirs, ours, settings, scene) for scene in shown]
-    images = [row for rows, _ in seen for row in rows]
-    if seen:
-        pictures = [picture for _, picture in seen]
+    made = [picture_of(options, theirs, ours, settings, scene) for scene in shown]
+    images = [row for rows, _ in made for row in rows]
+    if made:
+        pictures = [picture for _, picture in made]
         compare_figures.draw_methods(options.out / "pictures.png", pictures)
     metrics = {"points": list(pooled.values()), "best": best._asdict()}
     metrics |= {"images": evaluate.mean_rows(images), "each": each}
@@ -122,10 +122,10 @@ def main(options: Options) -> dict[str, Any]:
     return metrics
 
 
-def all_seen(options: Options) -> list[Seen]:
+def all_seen(options: Options) -> tuple[Seen, ...]:
     """All that their network is shown light and matter as."""
     densities = options.densities if options.effect == "sss" else (1.0,)
-    return [Seen(*both) for both in product(options.exposures, densities)]
+    return tuple(Seen(*both) for both in product(options.exposures, densities))
 
 
 def named(seen: Seen) -> str:

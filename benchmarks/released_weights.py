@@ -11,15 +11,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax.traverse_util import flatten_dict, unflatten_dict
+from flax.traverse_util import unflatten_dict
 
 from benchmarks.tensorflow_checkpoint import read_tensors
 from ginn_jax.architecture import Network
 from ginn_jax.errors import InputError
-from ginn_jax.example import blank_example
+from ginn_jax.given import weight_shapes
 from ginn_jax.kernels import Kernel
 from ginn_jax.network import Variables
-from ginn_jax.objective import init_variables
 from ginn_jax.presets import ILLUMINATION, SCATTERING
 
 NETWORKS = {"gi": ILLUMINATION["released"], "sss": SCATTERING["released"]}
@@ -118,19 +117,10 @@ def kernel_of(tensors: dict[str, np.ndarray], name: str) -> Kernel:
 
 
 def _check_shapes(network: Network, variables: Variables) -> None:
-    """Raise `ValueError` unless these are arrays of that network."""
-
-    def init() -> Variables:
-        return init_variables(network, blank_example(network), key=jax.random.key(0))
-
-    wanted, found = map(_shapes, (jax.eval_shape(init), variables))
-    for path in sorted(wanted | found):
-        if wanted.get(path) != found.get(path):
-            raise ValueError(f"{'.'.join(path)} is {found.get(path)}")
-
-
-def _shapes(variables: Variables) -> dict[tuple[str, ...], Any]:
-    return {
-        path: jax.tree.map(np.shape, leaf)
-        for path, leaf in flatten_dict(variables).items()
-    }
+    """Raise `ValueError` naming the first array that is not of that network."""
+    shapes, _ = weight_shapes(network)
+    found = jax.tree_util.tree_leaves_with_path(variables)
+    for (path, array), shape in zip(found, shapes, strict=True):
+        if array.shape != shape:
+            name = jax.tree_util.keystr(path, simple=True, separator=".")
+            raise ValueError(f"{name} is {array.shape}")
