@@ -27,6 +27,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     subsurface        radiant exitance by random walks in a medium
     objects           where objects and lights come from
     pairing           which of them go together, and what for
+    outlying          points far from all others, set apart
     ranges            ranges of rows expanded to lists, tile by tile
     voxels            points sorted by voxel, found by binary search under jit
     candidates        points that packets of queries may be near

@@ -5,6 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
+from ginn_jax.outlying import box_of_most
+
 # Cells an axis: rounding moves a point by less than `MARGIN` of so many cells. And in
 # all: an empty cell costs a word.
 LONGEST, MOST, MARGIN = 1000, 1 << 19, 1e-3
@@ -14,7 +16,8 @@ class Cells(NamedTuple):
     """Points sorted by the number of their cell, z fastest; rows start[c] :
     start[c + 1] are in cell c.
 
-    A point at `position` is in the cell floor((position - low) * rate) of each axis.
+    A point at `position` is in the cell floor((position - low) * rate) of each axis, in
+    the first or the last where that is beyond them.
     """
 
     order: Int[np.ndarray, "N"]
@@ -27,9 +30,13 @@ class Cells(NamedTuple):
 
 def sort_into_cells(position: Float[np.ndarray, "N 3"], radius: float) -> Cells:
     """Cells at least so wide that all points within `radius` of any place lie in its
-    own cell and the 26 around it."""
+    own cell and the 26 around it. What lies far from most is in cells of the border."""
     along = np.ascontiguousarray(position.T)
     low, high = along.min(axis=1), along.max(axis=1)
+    box = box_of_most(position, radius)
+    if box is not None:
+        low, high = np.maximum(low, box[0]), np.minimum(high, box[1])
+        along = np.clip(along, low[:, None], high[:, None])
     # A little more, so that rounding below adds no cell.
     extent = (high.astype(np.float64) - low) * (1 + 1e-6)
     width = max((1 + MARGIN) * radius, extent.max() / LONGEST)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from ginn_jax.candidates import (
     PACKET,
+    WORD,
     Candidates,
     count_words,
     packet_candidates,
@@ -19,6 +20,7 @@ from ginn_jax.candidates import (
 )
 from ginn_jax.checks import FAR, real_array, within_reach
 from ginn_jax.errors import InputError
+from ginn_jax.outlying import Parts, set_apart
 from ginn_jax.packets import Words, list_bits, packet_words
 from ginn_jax.pairs import Pairs, decide, in_order, join
 from ginn_jax.process import ALONE, available_cores
@@ -53,6 +55,9 @@ def find_neighbors(
     if not (len(points) and len(queries)):
         as_points("queries", queries)  # refused all the same
         return np.zeros(0, np.int32), np.zeros(0, np.int32)
+    parts = set_apart(points, queries, radius)
+    if parts is not None:
+        return _search_apart(points, queries, radius, parts)
     center = 0.5 * (points.min(0) + points.max(0))
     if len(points) > MANY:
         near = offsets_from(center, as_points("queries", queries))
@@ -60,6 +65,23 @@ def find_neighbors(
         pairs = _search(points, queries.take(order, axis=0), radius, center)
         return in_order(*pairs, order)
     return _search(points, queries, radius, center)
+
+
+def _search_apart(
+    points: Float[np.ndarray, "N 3"],
+    queries: Shaped[np.ndarray, "M 3"],
+    radius: float,
+    parts: Parts,
+) -> tuple[Int[np.ndarray, "E"], Int[np.ndarray, "E"]]:
+    """`find_neighbors` of either half by itself."""
+    pairs = [(np.zeros(0, np.int32), np.zeros(0, np.int32))]
+    for asked, near in parts:
+        query, point = find_neighbors(points[near], queries[asked], radius)
+        rows = asked.astype(np.int32), near.astype(np.int32)
+        pairs.append((rows[0][query], rows[1][point]))
+    query, point = map(np.concatenate, zip(*pairs, strict=True))
+    order = np.argsort(query, kind="stable")
+    return query[order], point[order]
 
 
 def _search(
@@ -154,11 +176,13 @@ def _search_block(
     under, columns = _columns(grid, *turned[:2], shell[1])
     size = bucket(8 * rows)
     near, need = _candidates(grid, under, bucket(int(columns)), size)
-    if int(need) > size:
-        size = bucket(int(need))
-        near, need = _candidates(grid, under, bucket(int(columns)), size)
-    lists = int(count_words(near))
-    if lists > WORD_BLOCK and len(queries) > PACKET:
+    lists, many = -(-int(need) // WORD), len(queries) > PACKET
+    if lists <= WORD_BLOCK or not many:  # else there are so many lists at least
+        if int(need) > size:
+            size = bucket(int(need))
+            near, _ = _candidates(grid, under, bucket(int(columns)), size)
+        lists = int(count_words(near))
+    if lists > WORD_BLOCK and many:
         half = len(queries) // 2
         yield from _search_block(grid, queries[:half], shell, first)
         yield from _search_block(grid, queries[half:], shell, first + half)

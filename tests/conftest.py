@@ -128,6 +128,15 @@ def at_once(monkeypatch):
     monkeypatch.setattr(timing, "WARM", 0.0)
 
 
+@pytest.fixture
+def far_in_few(monkeypatch):
+    """Points far from others are looked for in clouds of any size."""
+    from ginn_jax import outlying  # after the hook, as above
+
+    for name, value in (("MANY", 2), ("ASKED", 2), ("WIDE", 0), ("FAR_OFF", 2)):
+        monkeypatch.setattr(outlying, name, value)
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _forget_compilations():
     """Each module's own: thousands of kernels exhaust the maps a process may have."""

@@ -78,6 +78,12 @@ def test_each_point_near_is_visited_once(scene):
     check(*scene)
 
 
+@pytest.mark.usefixtures("far_in_few")
+@given(scenes())
+def test_each_point_near_is_visited_once_if_some_are_far_from_most(scene):
+    check(*scene)
+
+
 def test_a_lane_that_has_seen_enough_goes_no_further():
     """Of a crowd in three columns each lane counts as many as it wants."""
     dr = use_drjit()
