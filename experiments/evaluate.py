@@ -47,6 +47,7 @@ from ginn_jax.compare_pictures import (
 )
 from ginn_jax.compare_screen import screen_pictures
 from ginn_jax.compare_tracing import traced_rows, with_reference
+from ginn_jax.estimates import check_stratified
 from ginn_jax.evaluate import Row, at_scale
 from ginn_jax.experiment import make
 from ginn_jax.lit_clouds import Cloud
@@ -72,8 +73,7 @@ class Options:
     only_3d: str | None = None
     """The same of the 3D-only network."""
     beside: tuple[str, ...] = ()
-    """The --out of runs of other networks of the effect, as of another width, or names
-    as "ao_fine": beside ours where error is compared with run time."""
+    """The --out of other runs, or names as "ao_fine": beside ours in run time."""
     meshes: Path | None = None
     """A mesh file or a folder of unseen meshes; left out, procedural shapes."""
     envmaps: Path | None = None
@@ -102,8 +102,7 @@ class Options:
     looks: int = 512
     """Directions of the direct light per sample and pixel: what all are given."""
     fewer_looks: tuple[int, ...] = (32, 128)
-    """So many directions instead, at which our network runs as well, what samples and
-    light take counted in its time."""
+    """So many instead, where what samples and light take is counted as well."""
     radius: float = 0.1
     """Occlusion radius."""
     seed: int = 0
@@ -126,6 +125,7 @@ def main(options: Options) -> dict[str, Any]:
     require_shares(options, "shares")
     require_some(options, "counts")
     tuple(map(shading_step, options.scales))  # raises for what is no scale
+    tuple(map(check_stratified, () if options.effect == "ao" else options.counts))
     console = Console()
     targets = 64 if options.quick else TARGET_PATHS
     given = options.effect, options.points, targets, options.radius

@@ -17,6 +17,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     sdf, solids, *_shapes, shapes    the seeded source of procedural objects
     camera            pinhole cameras
     libllvm, renderer the ray tracer and its compiler, found and loaded
+    draws             random numbers of rays
     reference         ambient occlusion and G-buffers by ray tracing
     visible           samples of the surface that light can reach
     radiance_files    what the renderer does not check of a map's file

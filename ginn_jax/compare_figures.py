@@ -28,6 +28,7 @@ STYLES = {
     "screen space": ("tab:olive", "s"),
     "traced": ("tab:gray", "^-"),
     "traced and denoised": ("black", "^-"),
+    "traced and denoised fast": ("black", "v--"),
 }
 
 
@@ -40,6 +41,8 @@ def draw_front(path: Path, rows: list[Row], counted: Sequence[Row]) -> None:
     rates = [r for r in fresh if "scale" in r["method"] and r not in fewer]
     means = [r for r in fresh if "mean" in r["method"]]
     best = pareto_front(counted)
+    denoised = [r for r in rows if "denoised" in r]
+    quick = [r for r in denoised if r["method"].endswith("fast")]
     groups = {
         OURS: [r for r in fresh if r not in fewer + rates + means],
         f"{OURS}, fewer samples": fewer,
@@ -55,7 +58,8 @@ def draw_front(path: Path, rows: list[Row], counted: Sequence[Row]) -> None:
             r for r in rows if r["method"] in ("screen space", "visibility bitmask")
         ],
         "traced": [r for r in rows if "traced" in r],
-        "traced and denoised": [r for r in rows if "denoised" in r],
+        "traced and denoised": [r for r in denoised if r not in quick],
+        "traced and denoised fast": quick,
     }
     kept = {n: [_short(r) for r in group] for n, group in groups.items() if group}
     report.draw_error_against_time(path, kept, STYLES)
@@ -63,7 +67,8 @@ def draw_front(path: Path, rows: list[Row], counted: Sequence[Row]) -> None:
 
 def _short(row: Row) -> Row:
     """A row whose label leaves out what its line in the figure says."""
-    name = row["method"].removesuffix(", denoised").removesuffix(", codes kept")
+    name = row["method"].removesuffix(" fast").removesuffix(", denoised")
+    name = name.removesuffix(", codes kept")
     name = name.removeprefix(f"{OURS}, ").removeprefix(OTHER)
     name = name.replace(" of samples, scale", " at").replace(" of samples", "")
     return row | {"method": name}

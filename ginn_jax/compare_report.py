@@ -88,7 +88,7 @@ def write_report(m: Mapping[str, Any]) -> str:
     rows = report.beside_tracing(m["error_against_time"], "traced")
     lost = "\n".join(f"- {line}" for line in m["lost_cells"]) or "None."
     ours = next(row for row in m["results"] if row["method"] == OURS)
-    denoiser = "" if m["denoiser"] else " Open Image Denoise was not installed."
+    denoiser = "" if m["denoiser"] else " It was not installed."
     return f"""# {TITLES[options["effect"]]}
 
 `{m["command"]}`, {m["objects"]} unseen
@@ -130,8 +130,10 @@ f_2D takes {m["share_2d"]:.0%} of our network's time (paper: 60 %).
 
 ## Error against run time
 
-Over the first view of every scene, times as above.{denoiser} Where one path takes
-longer than a network, tracing's MSE "at equal time" is that of one path. Codes kept:
+Over the first view of every scene, times as above. What is traced is stratified over
+the pixel's rays or paths, the reference is not; denoised is by Open Image Denoise of
+high quality, or fast.{denoiser} Where one path takes longer than a network, tracing's
+MSE "at equal time" is that of one path. Codes kept:
 the time of another view of the same scene in the same light, f_2D alone.
 
 {report.table_of(rows, against | report.TRACING)}

@@ -19,13 +19,19 @@ from ginn_jax.lit_views import LitView
 from ginn_jax.reference import Estimate
 from ginn_jax.scenes import Occlusion, Settings
 
+# Of the denoiser: its default, and the quickest; what a row's name says of them.
+QUALITIES = {"High": "", "Fast": " fast"}
 
-def trace(shot: Shot, settings: Settings, count: int, *, seed: int) -> Truth:
+
+def trace(
+    shot: Shot, settings: Settings, count: int, *, stratified: bool = False, seed: int
+) -> Truth:
     """Ray or path tracing of the pixels with `count` each."""
+    drawn: Any = {"stratified": stratified, "seed": seed}
     if isinstance(shot, View):
         assert isinstance(settings, Occlusion)
-        return evaluate.traced(shot, settings.radius, count, seed=seed)
-    return lit_views.traced(shot, count, seed=seed)
+        return evaluate.traced(shot, settings.radius, count, **drawn)
+    return lit_views.traced(shot, count, **drawn)
 
 
 def with_reference(
@@ -51,41 +57,44 @@ def traced_rows(
     for count in counts:
         noisy = traced_picture(shot, settings, count, units, seed=seed)
         rows.append(noisy.row)
-        if denoised := denoised_picture(shot, noisy, units):
-            rows.append(denoised.row)
+        for quality in QUALITIES:
+            if denoised := denoised_picture(shot, noisy, units, quality):
+                rows.append(denoised.row)
     return rows
 
 
 def traced_picture(
     shot: Shot, settings: Settings, count: int, units: Any, *, seed: int
 ) -> Picture:
-    """Ray or path tracing with so many rays or paths a pixel."""
-    work = partial(trace, shot, settings, count, seed=seed)
+    """Ray or path tracing with so many rays or paths a pixel, stratified."""
+    work = partial(trace, shot, settings, count, stratified=True, seed=seed)
     truth, seconds = timed(work)
     what = "rays" if isinstance(shot, View) else "paths"
     row = {"method": f"{count} {what}", "traced": count, "seconds": seconds}
     return Picture(row | errors(shot, truth.mean, units), truth.mean)
 
 
-def denoised_picture(shot: Shot, noisy: Picture, units: Any) -> Picture | None:
+def denoised_picture(
+    shot: Shot, noisy: Picture, units: Any, quality: str
+) -> Picture | None:
     """A traced picture after Open Image Denoise, guided by albedo and normals.
 
     None where the optional package `mitsuba_oidn` is not installed.
     """
     try:
-        denoise = importlib.import_module("mitsuba_oidn").denoise
+        oidn = importlib.import_module("mitsuba_oidn")
     except ImportError:
         return None
     gbuffer = shot.gbuffer
     mask, (color, albedo) = gbuffer.mask, denoiser_inputs(shot, noisy.values)
     guides = {"albedo": albedo, "normal": gbuffer.normal.astype(np.float32)}
     hdr = isinstance(shot, LitView)
-    work = partial(denoise, color, **guides, hdr=hdr, clean_aux=True)
-    image, seconds = timed(work)
+    how = {"hdr": hdr, "clean_aux": True, "quality": oidn.Quality[quality]}
+    image, seconds = timed(partial(oidn.denoise, color, **guides, **how))
     image = np.asarray(image)
     values = (image[..., 0] if isinstance(shot, View) else image)[mask]
     row = {
-        "method": f"{noisy.row['method']}, denoised",
+        "method": f"{noisy.row['method']}, denoised{QUALITIES[quality]}",
         "denoised": noisy.row["traced"],
         "seconds": noisy.row["seconds"] + seconds,
     }

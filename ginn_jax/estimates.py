@@ -1,5 +1,6 @@
 """Estimates of light at points: rays dealt out to lanes, their mean and variance."""
 
+import math
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -7,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ginn_jax.checks import LARGEST_SEED, whole
+from ginn_jax.errors import InputError
 from ginn_jax.mesh import Mesh
 from ginn_jax.reference import OFFSET, columns
 from ginn_jax.renderer import use_mitsuba
@@ -28,14 +30,41 @@ def joined(parts: Iterable[ColorEstimate]) -> ColorEstimate:
     return ColorEstimate(*(np.concatenate(number) for number in numbers))
 
 
-def check_draws(name: str, count: int, seed: int) -> None:
+def check_draws(name: str, count: int, seed: int, stratified: bool = False) -> None:
     """Raise `InputError` unless so many random draws a point can be made."""
+    if stratified:
+        check_stratified(count)
     whole(name, count, 1, PATHS_PER_LAUNCH)
     whole("seed", seed, 0, LARGEST_SEED)
 
 
-def summarize(values: Any, paths: int) -> ColorEstimate:
-    """Mean of every `paths` successive values, and the variance of that mean."""
+def sampler_of(points: int, paths: int, first: int, seed: int, stratified: bool) -> Any:
+    """Random numbers for the paths of so many points, the first of that number: of
+    Mitsuba, `stratified` over the paths of a point or independent."""
+    mi, _ = use_mitsuba()
+    import drjit as dr
+
+    kind = {"type": "multijitter", "sample_count": paths}
+    sampler = mi.load_dict(kind if stratified else {"type": "independent"})
+    if stratified:
+        sampler.set_samples_per_wavefront(paths)
+    number = np.random.SeedSequence((seed, first)).generate_state(1)[0]
+    sampler.seed(dr.opaque(mi.UInt32, int(number)), points * paths)
+    return sampler
+
+
+def check_stratified(paths: int) -> None:
+    """Raise `InputError` unless the sampler has strata for so many."""
+    side = math.isqrt(whole("paths", paths, 1, PATHS_PER_LAUNCH))
+    if paths % side:
+        more = -(-paths // side) * side
+        fewer = paths - paths % side
+        raise InputError(f"{paths} paths have no strata: give {fewer} or {more}")
+
+
+def summarize(values: Any, paths: int, stratified: bool) -> ColorEstimate:
+    """Mean of every `paths` successive values, and the variance of that mean, which is
+    known of independent values only."""
     import drjit as dr
 
     # Or each of the sums below would trace all paths anew.
@@ -48,7 +77,8 @@ def summarize(values: Any, paths: int) -> ColorEstimate:
     middle = np.stack([mean(c) for c in values], axis=1)
     square = np.stack([mean(c * c) for c in values], axis=1)
     spread = np.maximum(square - middle**2, 0.0)
-    variance = spread / (paths - 1) if paths > 1 else np.full_like(spread, np.nan)
+    known = paths > 1 and not stratified
+    variance = spread / (paths - 1) if known else np.full_like(spread, np.nan)
     return ColorEstimate(middle.astype(np.float32), variance.astype(np.float32))
 
 

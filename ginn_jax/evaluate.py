@@ -38,8 +38,7 @@ from ginn_jax.upsample import shading_step
 
 Row = dict[str, Any]
 Image = Float[np.ndarray, "H W *C"]
-# What a background is that nothing occludes.
-OPEN = 1.0
+OPEN = 1.0  # a background that nothing occludes
 NUMBERS = int, float, np.number
 
 
@@ -136,11 +135,13 @@ def frame(mesh: Mesh, camera: Camera) -> View:
     return View(scene, gbuffer, fill(gbuffer.mask, nothing, OPEN), nothing)
 
 
-def traced(view: View, radius: float, rays: int, *, seed: int) -> Estimate:
+def traced(
+    view: View, radius: float, rays: int, *, stratified: bool = False, seed: int
+) -> Estimate:
     """Ray-traced ambient occlusion at the foreground pixels of a view."""
     mask = view.gbuffer.mask
-    position, normal = view.gbuffer.position[mask], view.gbuffer.normal[mask]
-    return ambient_occlusion(view.scene, position, normal, radius, rays=rays, seed=seed)
+    ends = view.scene, view.gbuffer.position[mask], view.gbuffer.normal[mask], radius
+    return ambient_occlusion(*ends, rays=rays, stratified=stratified, seed=seed)
 
 
 def with_truth(view: View, truth: Estimate) -> View:
@@ -225,8 +226,8 @@ def network_row(
 
 
 def ray_row(view: View, radius: float, rays: int, seed: int) -> Row:
-    """Error and time of ray-traced ambient occlusion at `rays` per pixel."""
-    truth, spent = timed(lambda: traced(view, radius, rays, seed=seed))
+    """Error and time of stratified ray tracing with `rays` per pixel."""
+    truth, spent = timed(lambda: traced(view, radius, rays, stratified=True, seed=seed))
     row = {"method": f"{rays} rays", "rays": rays, "seconds": spent}
     return row | image_errors(view, fill(view.gbuffer.mask, truth.mean, OPEN))
 

@@ -138,7 +138,7 @@ def lit_network_row(
 def path_row(
     view: LitView, paths: int, seed: int, scale: Float[np.ndarray, "C"]
 ) -> Row:
-    """Error and time of path tracing the same pixels with `paths` each."""
-    truth, seconds = timed(lambda: traced(view, paths, seed=seed))
+    """Error and time of stratified path tracing with `paths` a pixel."""
+    truth, seconds = timed(lambda: traced(view, paths, stratified=True, seed=seed))
     row = {"method": f"{paths} paths", "paths": paths, "seconds": seconds}
     return row | lit_image_errors(view, truth.mean, scale)

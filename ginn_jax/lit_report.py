@@ -59,7 +59,7 @@ Skipped steps (non-finite gradient): {m["skipped_steps"]}. Limits raised on the 
 In units of the squared mean light of each cloud and channel, against the expectation of
 the path-traced target (its noise is subtracted). Relative is over the variance of the
 target, pooled over clouds and channels as a ratio of means; equal paths is the number
-of paths per point at which path tracing has the same MSE.
+of independent paths per point at which path tracing has the same MSE.
 
 {report.table_of(report.unseen_sets(m), heads)}
 ## Error against run time
@@ -67,8 +67,9 @@ of paths per point at which path tracing has the same MSE.
 Means over {len(m["error_against_time_rows"]) // len(m["error_against_time"])} unseen
 objects at {options["resolution"]} x {options["resolution"]}, RGB, same pixels, same
 machine, same run; compilation, G-buffer, samples and direct light apart. The reference
-has {m["reference_paths"]} paths a pixel, whose noise is subtracted. DSSIM of what is
-displayed, after the paper's tone mapping, over the foreground.
+has {m["reference_paths"]} independent paths a pixel, whose noise is subtracted; path
+tracing beside is stratified. DSSIM of what is displayed, after the paper's tone
+mapping, over the foreground.
 
 {report.table_of(against, times | report.TRACING)}
 ![error against run time](error_against_time.png)

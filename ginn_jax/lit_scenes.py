@@ -134,15 +134,17 @@ def transport(
     normal: Float[np.ndarray, "N 3"],
     *,
     paths: int,
+    stratified: bool = False,
     seed: int,
 ) -> ColorEstimate:
     """Indirect irradiance, or radiant exitance where there is a medium."""
+    ends, cast = (position, normal), {"paths": paths, "seed": seed}
     if lit.medium.size == 0:
-        return indirect_irradiance(lit.scene, position, normal, paths=paths, seed=seed)
+        return indirect_irradiance(lit.scene, *ends, **cast, stratified=stratified)
     extinction, ior = (float(x) for x in lit.medium)
     medium = Medium(lit.albedo[0], extinction, ior)
-    ends = lit.scene, medium, position, normal
-    found, lost = subsurface_exitance(*ends, paths=paths, seed=seed)
+    known = lit.scene, medium, *ends
+    found, lost = subsurface_exitance(*known, **cast, stratified=stratified)
     if lost > MOST_LOST:
         warn(
             f"{lost:.0%} of the walks in the medium left it by holes of the mesh and "

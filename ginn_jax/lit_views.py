@@ -58,10 +58,12 @@ def lit_frame(
     return LitView(lit, gbuffer, pixels)
 
 
-def traced(view: LitView, paths: int, *, seed: int) -> ColorEstimate:
+def traced(
+    view: LitView, paths: int, *, stratified: bool = False, seed: int
+) -> ColorEstimate:
     """Path tracing of the transported light at the pixels of a view."""
-    ends = view.pixels.position, view.pixels.normal
-    return transport(view.lit, *ends, paths=paths, seed=seed)
+    ends = view.lit, view.pixels.position, view.pixels.normal
+    return transport(*ends, paths=paths, seed=seed, stratified=stratified)
 
 
 def with_truth(view: LitView, truth: ColorEstimate) -> LitView:

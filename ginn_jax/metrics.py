@@ -20,6 +20,8 @@ PERCENTILE = 90
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709, linear RGB
 # SSIM as in Wang et al. 2004: Gaussian window, 11 wide; K1 = .01, K2 = .03, range 1.
 SSIM_SIGMA, SSIM_WINDOW = 1.5, 11
+# Logarithm of so many times the counts and errors that were measured.
+FAR = 100.0
 
 Image = Float[np.ndarray, "..."]
 Mask = Bool[np.ndarray, "..."]
@@ -82,8 +84,10 @@ def equal_tracing(
     """What ray tracing comes to beside a method of this MSE and time.
 
     `traced` are the count of rays or paths a pixel, MSE and time of two runs at least.
-    An MSE is taken to fall as 1 / count, from the smallest, and times to be a line, a
-    flat one where what is measured does not grow.
+    Between counts an MSE is taken to fall as a power of the count, before them as 1 /
+    count, after them as between the last two, at least as 1 / count; one below 0, as
+    noise that is subtracted can make it, is left out (NaN if all are). Times are taken
+    to be a line, a flat one where what is measured does not grow.
 
     Returns the count and the time at equal MSE, and the ratio of the MSEs, tracing over
     the method's, at equal time: at one ray where there is time for less, at the most
@@ -92,14 +96,29 @@ def equal_tracing(
     if len({count for count, _, _ in traced}) < 2 or not error > 0:
         raise InputError(f"tracing beside MSE {error}: give two counts, an MSE over 0")
     counts, errors, times = np.array(sorted(traced), np.float64).T
-    single = float(errors[0] * counts[0])
+    if not (errors > 0).any():
+        return np.nan, np.nan, np.nan
+    n, e = _fall(counts[errors > 0], errors[errors > 0])
     slope, start = np.polyfit(counts, times, 1)
     if slope <= 0:
         slope, start = 0.0, times.mean()
     flat = counts[-1] if seconds >= start else 1.0
     affordable = max((seconds - start) / slope, 1.0) if slope > 0 else flat
-    equal = single / error
-    return equal, float(start + slope * equal), float(single / affordable / error)
+    equal = float(np.exp(np.interp(-np.log(error), -e, n)))
+    at_equal_time = np.exp(np.interp(np.log(affordable), n, e))
+    return equal, float(start + slope * equal), float(at_equal_time / error)
+
+
+def _fall(
+    counts: Float[np.ndarray, "K"], errors: Float[np.ndarray, "K"]
+) -> tuple[Float[np.ndarray, "P"], Float[np.ndarray, "P"]]:
+    """Logarithms of counts and MSEs that never rise, with one point far off at either
+    end."""
+    n, e = np.log(counts), np.log(np.minimum.accumulate(errors))
+    last = (e[-2] - e[-1]) / (n[-1] - n[-2]) if len(n) > 1 else 1.0
+    far = np.array([FAR])
+    n = np.concatenate([n[:1] - far, n, n[-1:] + far])
+    return n, np.concatenate([e[:1] + far, e, e[-1:] - max(last, 1.0) * far])
 
 
 def foreground(reference: Image) -> Mask:

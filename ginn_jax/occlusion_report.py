@@ -32,7 +32,7 @@ Skipped steps (non-finite gradient): {m["skipped_steps"]}. Limits raised on the 
 
 MSE is against the expectation of the ray-traced target (its noise is subtracted);
 relative is over the variance of the target, pooled over the clouds; equal rays is the
-number of rays per point at which ray tracing has the same MSE.
+number of independent rays per point at which ray tracing has the same MSE.
 
 {report.table_of(report.unseen_sets(m), heads)}
 ## Error against run time
@@ -40,7 +40,8 @@ number of rays per point at which ray tracing has the same MSE.
 Means over {len(m["foreground_pixels"])} unseen objects at {options["resolution"]} x
 {options["resolution"]} ({", ".join(map(str, m["foreground_pixels"]))} foreground
 pixels), same pixels, same machine, same run; compilation, G-buffer and
-samples of the surface apart. DSSIM after the paper's tone mapping, over the foreground.
+samples of the surface apart. Ray tracing beside is stratified, the reference is not.
+DSSIM after the paper's tone mapping, over the foreground.
 
 {report.table_of(against, times | report.TRACING)}
 ![error against run time](error_against_time.png)

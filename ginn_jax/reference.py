@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int, UInt
 
 from ginn_jax.camera import Camera, pixel_directions
 from ginn_jax.checks import LARGEST_SEED, positive, unit_rows, whole
+from ginn_jax.draws import random_pair, stratified_pair
 from ginn_jax.errors import InputError
 from ginn_jax.mesh import Mesh, check_mesh
 from ginn_jax.renderer import use_mitsuba
@@ -54,6 +55,7 @@ def ambient_occlusion(
     radius: float,
     *,
     rays: int,
+    stratified: bool = False,
     seed: int,
 ) -> Estimate:
     """Openness: the cosine-weighted fraction of rays that travel `radius` unblocked.
@@ -62,15 +64,21 @@ def ambient_occlusion(
     independent rays, so the variance of the mean is p(1-p)/(rays-1), NaN for one ray.
     The rays of a point depend on `seed` (32 bits) and its place in `points` alone.
 
+    With `stratified` they are spread evenly instead (see `stratified_pair`), every ray
+    by itself still distributed as before: the error is less, but how large is not
+    known, so the variance is NaN.
+
     Pass a `Scene` from `build_scene` to cast at the same mesh again. `normals` must be
     unit vectors of the surface the points lie on. Raises `InputError` on bad input.
     """
     scene = mesh if isinstance(mesh, Scene) else build_scene(mesh)
     points, normals = check_cast(scene, points, normals, radius, rays, seed)
     number = np.arange(len(points), dtype=np.uint32)
-    blocked = count_blocked(scene, points, normals, number, radius, (0, rays), seed)
+    ends = scene, points, normals, number
+    blocked = count_blocked(*ends, radius, (0, rays), seed, stratified)
     p = 1 - blocked / rays
-    variance = p * (1 - p) / (rays - 1) if rays > 1 else np.full_like(p, np.nan)
+    known = rays > 1 and not stratified
+    variance = p * (1 - p) / (rays - 1) if known else np.full_like(p, np.nan)
     return Estimate(p.astype(np.float32), variance.astype(np.float32))
 
 
@@ -114,17 +122,19 @@ def count_blocked(
     radius: float,
     cast: tuple[int, int],
     seed: int,
+    stratified: bool = False,
 ) -> UInt[np.ndarray, "N"]:
     """How many of each point's rays hit something within `radius`.
 
     The rays of a point depend on its `number` and `seed`; those `cast` are from the
-    first number to before the second.
+    first number to before the second, which `stratified` ones are spread for.
     """
     each = max(cast[1] - cast[0], 1)
     parts = []
     for place, normal, i in launches(points, normals, each, RAYS_PER_LAUNCH):
         own = number[i : i + len(place)]
-        parts.append(_count_of_launch(scene, place, normal, own, radius, cast, seed))
+        ends = scene, place, normal, own, radius, cast, seed
+        parts.append(_count_of_launch(*ends, stratified))
     return np.concatenate([np.zeros(0, np.uint32), *parts])
 
 
@@ -136,6 +146,7 @@ def _count_of_launch(
     radius: float,
     cast: tuple[int, int],
     seed: int,
+    stratified: bool,
 ) -> UInt[np.ndarray, "n"]:
     """`count_blocked` of as many points as are taken at a time.
 
@@ -154,7 +165,8 @@ def _count_of_launch(
         point = lane // dr.opaque(mi.UInt32, rays)
         ray = lane - point * dr.opaque(mi.UInt32, rays) + dr.opaque(mi.UInt32, cast[0])
         own = dr.gather(mi.UInt32, mi.UInt32(number), point)
-        a, b = random_pair(own, ray, dr.opaque(mi.UInt32, seed))
+        draw = stratified_pair(cast[1]) if stratified else random_pair
+        a, b = draw(own, ray, dr.opaque(mi.UInt32, seed))
         square = mi.Point2f(mi.Float(a >> 8) * 2**-24, mi.Float(b >> 8) * 2**-24)
         hemisphere = mi.warp.square_to_cosine_hemisphere(square)
         normal = dr.gather(mi.Normal3f, mi.Normal3f(columns(normals)), point)
@@ -163,23 +175,6 @@ def _count_of_launch(
         shot.maxt = dr.opaque(mi.Float, radius)
         blocked = dr.select(scene.handle.ray_test(shot), mi.UInt32(1), mi.UInt32(0))
         return dr.block_reduce(dr.ReduceOp.Add, blocked, rays).numpy()
-
-
-def random_pair(x: Any, y: Any, z: Any) -> tuple[Any, Any]:
-    """Two random words from three words: `pcg3d` of Jarzynski and Olano, JCGT 2020.
-
-    Hashing (point, ray, seed) makes the rays the same however points are chunked.
-    Mitsuba's `sample_tea_32` is no substitute: at its default of 4 rounds the mean of
-    a point's rays varied 1.4 to 4 times as much as that of independent ones.
-    """
-    x, y, z = (v * 1664525 + 1013904223 for v in (x, y, z))
-    x += y * z
-    y += z * x
-    z += x * y
-    x, y, z = (v ^ (v >> 16) for v in (x, y, z))
-    x += y * z
-    y += z * x
-    return x, y
 
 
 def render_gbuffer(mesh: Mesh | Scene, camera: Camera) -> GBuffer:

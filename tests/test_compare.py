@@ -160,15 +160,16 @@ def test_scenes_that_a_run_trained_on_are_named(scene, seen, tmp_path, caplog):
 
 @pytest.mark.usefixtures("small_programs")
 def test_light_is_compared_with_tracing_plain_and_denoised(tmp_path, monkeypatch):
-    """By a denoiser that leaves the image as it is."""
+    """By a denoiser that leaves the image as it is, or makes it half as bright."""
     network = replace(tiny.ONE_LEVEL, lights=1, materials=3, asks="all", local=True)
     asked = []
 
-    def denoise(color, albedo, normal, hdr, clean_aux):
+    def denoise(color, albedo, normal, hdr, clean_aux, quality):
         asked.append((color.shape, albedo.shape, normal.shape, hdr, clean_aux))
-        return color
+        return color / quality
 
-    monkeypatch.setitem(sys.modules, "mitsuba_oidn", SimpleNamespace(denoise=denoise))
+    oidn = SimpleNamespace(denoise=denoise, Quality={"High": 1, "Fast": 2})
+    monkeypatch.setitem(sys.modules, "mitsuba_oidn", oidn)
     ours = finished_run(tmp_path / "ours", network)
     splats = finished_run(tmp_path / "splats", replace(network, splat=True))
     options = experiment.Options(
@@ -199,6 +200,8 @@ def test_light_is_compared_with_tracing_plain_and_denoised(tmp_path, monkeypatch
     plain, denoised = rows["2 paths"], rows["2 paths, denoised"]
     assert denoised["mse_2d"] == pytest.approx(plain["mse_2d"], rel=1e-5)
     assert denoised["seconds"] > plain["seconds"]
+    quick = rows["2 paths, denoised fast"]
+    assert quick["mse_2d"] != denoised["mse_2d"]
     assert asked[0] == (*[(40, 40, 3)] * 3, True, True)
     half = rows["ours, 0.5 of samples"]["mse_2d"]
     assert half != rows[OURS]["mse_2d"]

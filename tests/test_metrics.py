@@ -208,6 +208,26 @@ def test_tracing_at_equal_error_and_at_equal_time(single, start, slope, error):
     assert at_once[2] == pytest.approx(single / error)
 
 
+def test_tracing_that_falls_faster_than_independent_rays():
+    """As count^-2 to 4 rays, count^-1 to 16; then a measurement that noise sank."""
+    traced = [(1, 1.0, 1.0), (4, 1 / 16, 4.0), (16, 1 / 64, 16.0), (64, -1e-3, 64.0)]
+    for error, count in [(4.0, 0.25), (0.25, 2), (1 / 32, 8), (1 / 256, 64)]:
+        equal, seconds, _ = metrics.equal_tracing(error, 1.0, traced)
+        assert equal == pytest.approx(count)
+        assert seconds == pytest.approx(count)
+    for count, error in [(2, 0.25), (8, 1 / 32), (64, 1 / 256)]:
+        assert metrics.equal_tracing(1.0, float(count), traced)[2] == pytest.approx(
+            error
+        )
+    steep = traced[:2]
+    assert metrics.equal_tracing(1 / 256, 16.0, steep)[0] == pytest.approx(16)
+    # It is as little below what fewer rays had as measured, and never above.
+    risen = [*steep, (16, 0.5, 16.0)]
+    assert metrics.equal_tracing(1.0, 16.0, risen)[2] == pytest.approx(1 / 16)
+    sunk = [(n, -1.0, t) for n, _, t in traced]
+    assert np.isnan(metrics.equal_tracing(0.1, 1.0, sunk)).all()
+
+
 @pytest.mark.parametrize(("error", "counts"), [(0.0, (1, 4)), (0.1, (4, 4)), (0.1, ())])
 def test_tracing_beside_nothing_is_refused(error, counts):
     with pytest.raises(InputError, match="give two counts, an MSE over 0"):

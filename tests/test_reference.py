@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from rooms import UP, copies, floor, floor_and_wall, joined, solid
 
-from ginn_jax import reference
+from ginn_jax import draws, reference
 from ginn_jax.camera import Camera
 
 
@@ -119,7 +119,7 @@ def test_seed_decides_and_chunks_do_not(monkeypatch):
 def test_random_numbers_of_points_rays_and_seeds_are_independent(axis):
     """Averages over any of the three vary as much as those of independent numbers."""
     words = np.indices((1000, 16, 16), np.uint32)
-    a, b = (word / 2**32 for word in reference.random_pair(*words))
+    a, b = (word / 2**32 for word in draws.random_pair(*words))
     disk, checks = (a - 0.5) ** 2 + (b - 0.5) ** 2 < 0.1, (a * 64 % 2 < 1) ^ (b < 0.5)
     for event, p in [
         (a < 0.5, 0.5),
