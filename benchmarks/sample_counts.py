@@ -28,6 +28,7 @@ from ginn_jax.compare_networks import Trained, load_trained
 from ginn_jax.compare_pictures import rows_at_points
 from ginn_jax.dataset import count_asked, count_given
 from ginn_jax.lit_clouds import Cloud, points_of
+from ginn_jax.metrics import pooled_interval
 from ginn_jax.scenes import Occlusion, Settings, made_cloud
 
 
@@ -91,7 +92,7 @@ def main(options: Options) -> dict[str, Any]:
         given = trained, fewer, sources, with_points(settings, count)
         found, _ = rows_at_points(*given)
         samples = {"samples": count_given(count)}
-        rows.append(samples | evaluate.pool_rows(found))
+        rows.append(samples | evaluate.pool_rows(found) | interval(found))
         each += [samples | row for row in found]
     metrics = {"rows": rows, "each": each} | circumstances(options, begin)
     text = write_report(options, trained, metrics)
@@ -120,6 +121,14 @@ def rows_of(count: int, share: float) -> Int[np.ndarray, "_"]:
     return np.r_[:first, given : given + total - first]
 
 
+def interval(found: list[evaluate.Row]) -> evaluate.Row:
+    """What the pooled relative error might be of other scenes of the same kind."""
+    lit = [row for row in found if np.isfinite(row["mse_3d"])]
+    parts = ([row[part] for row in lit] for part in ("mse_3d", "variance_3d"))
+    low, high = pooled_interval(*parts)
+    return {"low": low, "high": high}
+
+
 def worst(each: list[evaluate.Row]) -> list[evaluate.Row]:
     """The scenes that most of the pooled error is of, where all samples are given."""
     most = max(row["samples"] for row in each)
@@ -132,7 +141,8 @@ def worst(each: list[evaluate.Row]) -> list[evaluate.Row]:
 def write_report(options: Options, trained: Trained, metrics: evaluate.Row) -> str:
     """The table and how it was measured."""
     heads = {"samples": "samples given", "relative_mse_3d": "relative 3D MSE"}
-    heads |= {"median_relative_mse_3d": "median", "noise_floor_3d": "noise floor"}
+    heads |= {"low": "from", "high": "to", "median_relative_mse_3d": "median"}
+    heads |= {"noise_floor_3d": "noise floor"}
     heads |= {"equal_rays": "equal rays or paths"}
     scene = {"name": "scene", "relative_mse_3d": "relative 3D MSE", "mse_3d": "3D MSE"}
     scene |= {"share": "share of the error of all scenes"}
@@ -145,7 +155,8 @@ def write_report(options: Options, trained: Trained, metrics: evaluate.Row) -> s
 {metrics["rows"][0]["clouds"]} scenes, Poisson disk radii {trained[0].levels}. The
 network is given the first of the same samples, and asked at the first of the same other
 points; noise of the reference ({options.reference} rays or paths) is subtracted.
-Relative: over the variance of the target, pooled over the scenes.
+Relative: over the variance of the target, pooled over the scenes; in 95 % of draws of
+as many scenes from these it is "from" ... "to".
 
 {report.table_of(metrics["rows"], heads)}
 Most of the error with all samples is of

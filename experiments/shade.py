@@ -26,7 +26,7 @@ from matplotlib.image import imsave
 from ginn_jax import compare, lit_views
 from ginn_jax.camera import Camera, orbit_camera
 from ginn_jax.checks import number, positive
-from ginn_jax.commandline import require, start
+from ginn_jax.commandline import hasten, require, start
 from ginn_jax.compare_networks import Trained
 from ginn_jax.errors import InputError
 from ginn_jax.evaluate import Model
@@ -96,6 +96,7 @@ class Options:
 
 
 QUICK = {"resolution": 64, "points": 4000, "looks": 32}
+OF_IMAGES = ("azimuth", "elevation", "resolution", "resolution_scale", "points")
 
 
 def main(options: Options) -> Path:
@@ -123,12 +124,23 @@ def check(options: Options) -> None:
     """Raise `InputError` for options that cannot be meant."""
     require(options, {"resolution": 32, "points": 1000, "looks": 1, "seed": 0})
     shading_step(options.resolution_scale)
-    if options.scan is not None and (options.mesh or options.effect != "ao"):
-        raise InputError("--scan is for occlusion, without --mesh: leave that out")
+    if options.scan is not None:
+        check_scan(options)
     if options.effect == "ao" and options.envmap is not None:
         raise InputError("--envmap is light, occlusion has none: give another --effect")
     positive("--extinction", options.extinction, DENSE)
     number("--ior", options.ior, 1.0, 1.5)
+
+
+def check_scan(options: Options) -> None:
+    """Raise `InputError` for what a scan, of which no image is made, has no use for."""
+    if options.mesh or options.effect != "ao":
+        raise InputError("--scan is for occlusion, without --mesh: leave that out")
+    usual = hasten(Options(quick=options.quick), QUICK)
+    for name in OF_IMAGES:
+        if getattr(options, name) != getattr(usual, name):
+            option = "--" + name.replace("_", "-")
+            raise InputError(f"{option} is of images, --scan makes none: leave it out")
 
 
 def shade_occlusion(options: Options, mesh: Mesh, trained: Trained) -> Shaded:

@@ -13,6 +13,7 @@ Modules, in the order the data flows; each imports only what stands before it:
     process           settings of a process that make XLA faster on CPU
     commandline       options, one-line errors and exit codes of scripts
     orientation, mesh_files, mesh    triangles: loading, mending, ground
+    outlying          points far from all others, set apart
     samples           points on surfaces, drawn from a mesh or read from a scan
     sdf, solids, *_shapes, shapes    the seeded source of procedural objects
     camera            pinhole cameras
@@ -28,7 +29,6 @@ Modules, in the order the data flows; each imports only what stands before it:
     subsurface        radiant exitance by random walks in a medium
     objects           where objects and lights come from
     pairing           which of them go together, and what for
-    outlying          points far from all others, set apart
     ranges            ranges of rows expanded to lists, tile by tile
     voxels            points sorted by voxel, found by binary search under jit
     candidates        points that packets of queries may be near

@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from ginn_jax.errors import InputError
+
 # A GPU would round the factors of a product to ten bits by default.
 EXACT = jax.lax.Precision.HIGHEST
 _product = partial(jnp.matmul, precision=EXACT)
@@ -44,6 +46,19 @@ def init_kernel(
     ]
     biases = [jnp.zeros((blocks, shape[1])) for shape in shapes]
     return Kernel(weights[0], biases[0], weights[1], biases[1], weights[2], biases[2])
+
+
+def check_kernel(kernel: Kernel, inputs: int, outputs: int) -> None:
+    """Raise `InputError` unless it makes so many values of so many inputs."""
+    blocks, width, _ = kernel.w1.shape
+    group = kernel.w3.shape[2]
+    if width != inputs:
+        raise InputError(f"the kernel takes {width} inputs, edges have {inputs}")
+    if -(-outputs // group) != blocks:
+        raise InputError(
+            f"the kernel has {blocks} blocks of {group} values for {outputs} of the "
+            "convolution: give one that was made for them"
+        )
 
 
 def evaluate_kernel(

@@ -6,6 +6,7 @@ compiles what all of them do at once.
 
 import functools
 import threading
+import time
 import tracemalloc
 import weakref
 from collections.abc import Callable, Hashable, Sequence
@@ -25,6 +26,8 @@ PACKET, NARROW = 8, 8
 PROGRAMS, NEVER = 512, 1 << 30
 # Seconds that are waited for a thread which may have died.
 PATIENCE = 10.0
+# And so many pass until a thread that was counting memory has counted it.
+PAUSE = 0.1
 
 # Held while lanes run: all threads share what Dr.Jit traced once, and two that are in
 # it hang or end the process.
@@ -76,8 +79,10 @@ def most_held_mib(call: Callable[[], Any]) -> float:
         call()
         _, most = tracemalloc.get_traced_memory()
     finally:
-        # Or that may crash: CPython's issue 128679, mended in 3.12 and later.
+        # Or that may crash: CPython's issue 128679, mended in 3.12 and later. A thread
+        # that is counting waits for this one, which therefore pauses.
         wait_for_thread(dr)
+        time.sleep(PAUSE)
         tracemalloc.stop()
     return (most + dr.detail.malloc_watermark(backend) - held) / 2**20
 

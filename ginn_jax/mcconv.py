@@ -21,6 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from ginn_jax.kernels import (
     Kernel,
+    check_kernel,
     edges_first,
     edges_first_to_differentiate,
     evaluate_kernel,
@@ -32,8 +33,13 @@ from ginn_jax.receptive_field import Field, tile_size
 def mc_conv(
     kernel: Kernel, features: Float[Array, "N C"], field: Field, receivers: int
 ) -> Float[Array, "M C"]:
-    """Depth-wise convolution: channel c of the output sees channel c of the input."""
-    return _convolve(_depth_wise, receivers, features.shape[1], kernel, features, field)
+    """Depth-wise convolution: channel c of the output sees channel c of the input.
+
+    Raises `InputError` for a kernel made for other inputs or another width.
+    """
+    width = features.shape[1]
+    check_kernel(kernel, field.inputs.shape[0], width)
+    return _convolve(_depth_wise, receivers, width, kernel, features, field)
 
 
 def mc_conv_mixing(
@@ -43,7 +49,11 @@ def mc_conv_mixing(
     receivers: int,
     outputs: int,
 ) -> Float[Array, "M K"]:
-    """Full convolution: every output channel has a kernel for every input channel."""
+    """Full convolution: every output channel has a kernel for every input channel.
+
+    Raises `InputError` for a kernel made for other inputs or another width.
+    """
+    check_kernel(kernel, field.inputs.shape[0], outputs * features.shape[1])
     return _convolve(_mixing, receivers, outputs, kernel, features, field)
 
 

@@ -20,6 +20,7 @@ PERCENTILE = 90
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709, linear RGB
 # SSIM as in Wang et al. 2004: Gaussian window, 11 wide; K1 = .01, K2 = .03, range 1.
 SSIM_SIGMA, SSIM_WINDOW = 1.5, 11
+RESAMPLES = 4000  # by the bootstrap
 # Logarithm of so many times the counts and errors that were measured.
 FAR = 100.0
 
@@ -59,6 +60,23 @@ def relative_error(error: float, variance: float) -> float:
     gives the error no scale.
     """
     return error / variance if variance > 0 else float("nan")
+
+
+def pooled_interval(
+    errors: Sequence[float], variances: Sequence[float]
+) -> tuple[float, float]:
+    """Where 95 % of the pooled relative errors lie of as many clouds drawn anew.
+
+    Drawn from these with repetition (the bootstrap), always the same draws: how much of
+    the ratio of the means is chance of which clouds there are. NaN for fewer than two.
+    """
+    count = len(errors)
+    if count < 2:
+        return float("nan"), float("nan")
+    rows = np.random.default_rng(0).integers(0, count, (RESAMPLES, count))
+    above, below = (np.asarray(a, np.float64)[rows].sum(1) for a in (errors, variances))
+    low, high = np.percentile(above / below, (2.5, 97.5))
+    return float(low), float(high)
 
 
 def median_known(values: Sequence[float]) -> float:

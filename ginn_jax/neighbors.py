@@ -165,7 +165,7 @@ def _search_block(
     shell: Float[np.ndarray, "2"],
     first: int,
 ) -> Iterator[Pairs]:
-    """The pairs of a block of queries; a block with too much to list is halved.
+    """The pairs of a block of queries; one with too much to list is taken in parts.
 
     Nearer than the inner radius of the `shell` they are certain.
     """
@@ -183,9 +183,12 @@ def _search_block(
             near, _ = _candidates(grid, under, bucket(int(columns)), size)
         lists = int(count_words(near))
     if lists > WORD_BLOCK and many:
-        half = len(queries) // 2
-        yield from _search_block(grid, queries[:half], shell, first)
-        yield from _search_block(grid, queries[half:], shell, first + half)
+        # As many as will do, all of one size: each other size is compiled anew.
+        parts = 1 << (lists // WORD_BLOCK).bit_length()
+        each = max(-(-len(queries) // parts), PACKET)
+        for begin in range(0, len(queries), each):
+            part = queries[begin : begin + each]
+            yield from _search_block(grid, part, shell, first + begin)
         return
     words, edges = _words(grid, *turned, shell[1], near, bucket(lists))
     count = int(edges)

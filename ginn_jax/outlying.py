@@ -70,6 +70,12 @@ def box_of_most(points: Float[np.ndarray, "N 3"], radius: float) -> Box | None:
     return middle - 1.5 * width, middle + 1.5 * width
 
 
+def count_outlying(points: Float[np.ndarray, "N 3"]) -> int:
+    """How many points lie far from all others."""
+    box = box_of_most(points, 0.0)
+    return 0 if box is None else int((~_within(points, *box)).sum())
+
+
 def _box_of_all(
     points: Float[np.ndarray, "N 3"], queries: Shaped[np.ndarray, "M 3"], reach: float
 ) -> Box | None:

@@ -23,9 +23,10 @@ from ginn_jax.blocks import (
     pad_channels,
     pad_points,
 )
-from ginn_jax.checks import numbers_of, unit_rows
+from ginn_jax.checks import numbers_of, unit_rows, within_reach
 from ginn_jax.dataset import center_of
 from ginn_jax.errors import InputError
+from ginn_jax.given import check_weights
 from ginn_jax.inference import cloud_limits
 from ginn_jax.limits import (
     Demands,
@@ -48,6 +49,7 @@ from ginn_jax.plans import (
 )
 from ginn_jax.process import ALONE
 from ginn_jax.receptive_field import Oriented
+from ginn_jax.searches import check_limits
 
 
 class Relightable(NamedTuple):
@@ -97,8 +99,9 @@ def prepare_relighting(
     """A cloud and queries made ready for any light; the limits that sufficed.
 
     Raises:
-        InputError: an empty cloud, points that are not finite, normals not of unit
-            length, or a network that takes no light.
+        InputError: an empty cloud, points that are not finite or reach beyond 1e18,
+            normals not of unit length, a network that takes no light, or limits or
+            weights of another network.
     """
     if not network.lights:
         raise InputError("the network takes no light: give one of gi or sss")
@@ -106,6 +109,10 @@ def prepare_relighting(
         raise InputError("the cloud is empty: sample at least one point")
     unit_rows(cloud.position, cloud.normal, "the cloud")
     unit_rows(queries.position, queries.normal, "queries")
+    within_reach("the cloud", cloud.position)
+    within_reach("queries", queries.position)
+    check_limits(network, limits)
+    check_weights(network, variables)
     center = center_of(cloud.position)
     rows = bucket(len(cloud.position))
     points = pad_points(center, cloud.position, cloud.normal, rows)

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from ginn_jax.checks import LARGEST_INDEX, positive, unit_rows, whole
-from ginn_jax.errors import InputError
+from ginn_jax.errors import InputError, warn
 from ginn_jax.mesh import (
     Mesh,
     area_vectors,
@@ -18,6 +18,7 @@ from ginn_jax.mesh import (
     near_origin,
 )
 from ginn_jax.mesh_files import load_scene, readable
+from ginn_jax.outlying import count_outlying
 
 
 class Samples(NamedTuple):
@@ -62,7 +63,16 @@ def load_points(path: str | Path) -> Samples:
 
 
 def fit_unit_box_points(samples: Samples) -> Samples:
-    """The point cloud moved and scaled as `fit_unit_box` does; normals stay."""
+    """The point cloud moved and scaled as `fit_unit_box` does; normals stay.
+
+    Warns of a few points far from all others: what is between is empty, and the others
+    become small.
+    """
+    if far := count_outlying(samples.position):
+        warn(
+            f"{far} of {len(samples.position)} points lie so far from the others that "
+            "these become small in a box for all: drop them first"
+        )
     return samples._replace(position=into_unit_box(samples.position))
 
 

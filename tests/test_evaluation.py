@@ -207,7 +207,7 @@ def test_one_shot_in_which_the_machine_had_other_work_makes_no_time():
 
 def test_fronts_are_told_apart():
     """Kept codes and light that is counted have fronts of their own."""
-    base = {"variance_2d": 1.0, "dssim_2d": 0.1, "seconds_2d": 0.5}
+    base = {"name": "cow", "variance_2d": 1.0, "dssim_2d": 0.1, "seconds_2d": 0.5}
     ours = base | {"method": OURS, "mse_2d": 0.1, "seconds": 2.0}
     kept = ours | {"method": "kept one", "seconds": 0.5, "kept": 1}
     rays = {"method": "1 rays", "mse_2d": 0.5, "seconds": 1.0, "traced": 1}
@@ -216,6 +216,18 @@ def test_fronts_are_told_apart():
     assert found["front_counted"] == ["1 rays"]
     assert found["front_kept"] == ["kept one"]
     assert found["share_2d"] == 0.25
+
+
+def test_relative_errors_have_an_interval_over_scenes_not_views():
+    shots = [
+        {"method": OURS, "name": name, "mse_2d": error, "variance_2d": 1.0}
+        | {"seconds_2d": 1.0, "seconds": 1.0, "dssim_2d": 0.1}
+        for name, errors in {"cow": (0.0, 0.2), "well": (0.3, 0.5)}.items()
+        for error in errors
+    ]
+    [row] = summary("ao", {}, shots, shots, [])["results"]
+    # Of two scenes one is drawn twice every other time.
+    assert (row["low_2d"], row["high_2d"]) == pytest.approx((0.1, 0.4))
 
 
 def test_a_time_is_the_median_of_three_calls_after_a_first(monkeypatch):
@@ -234,6 +246,7 @@ def test_every_primary_has_its_share_of_luminance(channel, share):
     np.testing.assert_allclose(shown, (0.1 / (9 * share)) ** (1 / 1.6))
 
 
-def test_tracing_is_extrapolated_from_the_smallest_count():
+def test_tracing_is_extrapolated_from_the_largest_count():
+    """As 1 / count, though it fell less than that between the two."""
     found = metrics.equal_tracing(0.1, 1.0, [(4, 0.3, 4.0), (1, 1.0, 1.0)])
-    assert found[0] == pytest.approx(10)
+    assert found[0] == pytest.approx(12)

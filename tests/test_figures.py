@@ -194,6 +194,11 @@ def test_the_points_of_a_scan_are_shaded(tmp_path):
     ("wrong", "message"),
     [
         ({"scan": Path("a.ply"), "effect": "gi"}, "--scan is for occlusion"),
+        ({"scan": Path("a.ply"), "azimuth": 3.0}, "--azimuth is of images"),
+        (
+            {"scan": Path("a.ply"), "resolution_scale": 0.5},
+            "--resolution-scale is of images",
+        ),
         ({"scan": Path("a.ply"), "mesh": Path("a.obj")}, "--scan is for occlusion"),
         ({"scan": Path("no.ply")}, "no.ply: no such file"),
         ({"envmap": Path("sky.hdr")}, "--envmap is light, occlusion has none"),
@@ -205,6 +210,8 @@ def test_the_points_of_a_scan_are_shaded(tmp_path):
 )
 def test_what_cannot_be_shaded_is_named(tmp_path, wrong, message):
     usual = {"effect": "ao", "resolution": 32, "points": 1000, "looks": 1}
+    if "scan" in wrong:  # of which no image is made
+        usual = {}
     with pytest.raises(InputError, match=message):
         shade.main(shade.Options(out=tmp_path / "out", **usual | wrong))
 

@@ -28,6 +28,7 @@ from strategies import POINTS, QUERIES, UNIT
 from ginn_jax import kernels
 from ginn_jax import mcconv as mc
 from ginn_jax import receptive_field as rf
+from ginn_jax.errors import InputError
 from ginn_jax.network import splat
 
 pytestmark = pytest.mark.usefixtures("cheap_compiling")
@@ -217,3 +218,17 @@ def test_a_splat_is_the_mean_of_what_is_near_and_faces_alike():
         assert found[i] == pytest.approx(expected, abs=1e-4)
         alone += not len(near)
     assert 0 < alone < QUERIES
+
+
+@pytest.mark.parametrize(
+    ("inputs", "outputs", "message"),
+    [(4, 6, "takes 4 inputs, edges have 3"), (3, 9, "3 blocks of 4 values for 6")],
+)
+def test_a_kernel_made_for_something_else_is_refused(inputs, outputs, message):
+    zeros = np.zeros(8, np.int32)
+    field = rf.Field(zeros, zeros, np.zeros((3, 8), np.float32), np.ones(8), 8)
+    kernel = kernels.init_kernel(inputs, outputs, 4, 4, key=jax.random.key(0))
+    with pytest.raises(InputError, match=message):
+        mc.mc_conv(kernel, np.zeros((5, 6), np.float32), field, 5)
+    with pytest.raises(InputError, match=message):
+        mc.mc_conv_mixing(kernel, np.zeros((5, 2), np.float32), field, 5, 3)

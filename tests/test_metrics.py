@@ -208,6 +208,24 @@ def test_tracing_at_equal_error_and_at_equal_time(single, start, slope, error):
     assert at_once[2] == pytest.approx(single / error)
 
 
+def test_interval_of_a_pooled_error_is_that_of_a_ratio_of_means():
+    """Against the linearised spread of the ratio, of clouds that are alike."""
+    rng = np.random.default_rng(1)
+    variance = rng.uniform(0.5, 1.5, 400)
+    error = variance * rng.exponential(0.1, 400)
+    ratio = error.sum() / variance.sum()
+    off = (error - ratio * variance) / variance.mean()
+    sigma = off.std(ddof=1) / np.sqrt(400)
+    found = metrics.pooled_interval(list(error), list(variance))
+    expected = ratio - 1.96 * sigma, ratio + 1.96 * sigma
+    assert found == pytest.approx(expected, abs=0.2 * sigma)
+    assert found == metrics.pooled_interval(list(error), list(variance))
+    same = metrics.pooled_interval(list(0.3 * variance), list(variance))
+    assert same == pytest.approx((0.3, 0.3))
+    for few in ([], [0.1]):
+        assert np.isnan(metrics.pooled_interval(few, few)).all()
+
+
 def test_tracing_that_falls_faster_than_independent_rays():
     """As count^-2 to 4 rays, count^-1 to 16; then a measurement that noise sank."""
     traced = [(1, 1.0, 1.0), (4, 1 / 16, 4.0), (16, 1 / 64, 16.0), (64, -1e-3, 64.0)]

@@ -1,5 +1,7 @@
 """Points far from all others: searched by themselves, and no pair lost or doubled."""
 
+import warnings
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,7 +9,7 @@ from oracles import neighbors
 from scipy.spatial import cKDTree
 from strategies import RADII, clouds
 
-from ginn_jax import cells, outlying
+from ginn_jax import cells, outlying, samples
 from ginn_jax import neighbors as nb
 
 pytestmark = pytest.mark.usefixtures("cheap_compiling")
@@ -70,6 +72,19 @@ def test_one_far_point_leaves_cells_small():
     found = cells.sort_into_cells(points, 0.02)
     assert found.rate > 0.5 * alone.rate
     assert np.diff(found.start).max() <= 2 * np.diff(alone.start).max()
+
+
+@pytest.mark.parametrize("far", [0, 3])
+def test_points_that_make_a_scan_small_are_counted(far):
+    normal = np.random.default_rng(3).normal(size=(5000, 3)).astype(np.float32)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    position = normal.copy()
+    position[:far, 1] += 100
+    scan = samples.Samples(position, normal, np.zeros(5000, np.int32))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        samples.fit_unit_box_points(scan)
+    assert [str(w.message)[:18] for w in said] == ["3 of 5000 points l"] * (far > 0)
 
 
 @pytest.mark.parametrize("far_queries", [0, 3])

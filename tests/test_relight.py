@@ -44,14 +44,14 @@ def limits_of(network):
     return tiny.LIMITS if known else uniform_limits(network, 1 << 15)
 
 
-def lit(count, seed, medium=()):
+def lit(count, seed, medium=(), size=1.0):
     """The sphere on its plane, two materials, random light on every point."""
     points = tiny.sphere_on_plane(count, seed)
     rng = np.random.default_rng(seed)
     light = rng.gamma(0.5, size=(3, count, 3)).astype(np.float32)
     albedo = rng.uniform(0, 1, (2, 3)).astype(np.float32)
     material = (points.position[:, 1] < 1e-6).astype(np.int32)
-    columns = points.position, points.normal, material, *light
+    columns = np.float32(size) * points.position, points.normal, material, *light
     return LitCloud(*columns, albedo, np.array(medium))
 
 
@@ -196,6 +196,12 @@ def test_what_was_not_prepared_is_refused(prepared, cloud, queries, message):
     [
         (tiny.ONE_LEVEL, lit(400, 1), "the network takes no light"),
         (EFFECTS["homogeneous"], lit(0, 1), "the cloud is empty"),
+        (
+            EFFECTS["homogeneous"],
+            lit(400, 1, size=1e19),
+            "the cloud holds coordinates beyond",
+        ),
+        (EFFECTS["homogeneous"], lit(400, 1), "the weights are not"),
     ],
 )
 def test_what_cannot_be_lit_is_not_prepared(network, cloud, message):
