@@ -33,7 +33,7 @@ def sort_into_cells(position: Float[np.ndarray, "N 3"], radius: float) -> Cells:
     own cell and the 26 around it. What lies far from most is in cells of the border."""
     along = np.ascontiguousarray(position.T)
     low, high = along.min(axis=1), along.max(axis=1)
-    box = box_of_most(position, radius)
+    box = box_of_most(position, (low, high), radius)
     if box is not None:
         low, high = np.maximum(low, box[0]), np.minimum(high, box[1])
         along = np.clip(along, low[:, None], high[:, None])

@@ -37,10 +37,10 @@ def set_apart(
     Every pair closer than the radius is in one half, and none in both: each query is in
     one only.
     """
-    reach = 1.001 * radius
-    box = box_of_most(points, radius)
+    reach, bounds = 1.001 * radius, (points.min(axis=0), points.max(axis=0))
+    box = box_of_most(points, bounds, radius)
     if box is None:
-        box = _box_of_all(points, queries, reach)
+        box = _box_of_all(bounds, queries, reach)
     if box is None:
         return None
     low, high = box
@@ -52,13 +52,13 @@ def set_apart(
     return Parts((np.flatnonzero(inside), near), (np.flatnonzero(~inside), outer))
 
 
-def box_of_most(points: Float[np.ndarray, "N 3"], radius: float) -> Box | None:
+def box_of_most(
+    points: Float[np.ndarray, "N 3"], bounds: Box, radius: float
+) -> Box | None:
     """A cube three times as wide as what all but a few points take up, around them, if
-    others lie far from it."""
-    if len(points) < MANY:
-        return None
-    extent = np.ptp(points, axis=0).max()
-    if extent < WIDE * radius:
+    others lie far from it; `bounds` are those of all."""
+    extent = (bounds[1] - bounds[0]).max()
+    if len(points) < MANY or extent < WIDE * radius:
         return None
     some = np.sort(points[:: len(points) // ASKED], axis=0)
     few = len(some) // SHARE
@@ -72,15 +72,17 @@ def box_of_most(points: Float[np.ndarray, "N 3"], radius: float) -> Box | None:
 
 def count_outlying(points: Float[np.ndarray, "N 3"]) -> int:
     """How many points lie far from all others."""
-    box = box_of_most(points, 0.0)
+    box = None
+    if len(points):
+        box = box_of_most(points, (points.min(axis=0), points.max(axis=0)), 0.0)
     return 0 if box is None else int((~_within(points, *box)).sum())
 
 
 def _box_of_all(
-    points: Float[np.ndarray, "N 3"], queries: Shaped[np.ndarray, "M 3"], reach: float
+    bounds: Box, queries: Shaped[np.ndarray, "M 3"], reach: float
 ) -> Box | None:
-    """What is within reach of the points, if queries lie far from it."""
-    low, high = points.min(axis=0), points.max(axis=0)
+    """What is within reach of all points, if queries lie far from it."""
+    low, high = bounds
     far = FAR_OFF * max((high - low).max(), reach)
     if queries.min() >= low.min() - far and queries.max() <= high.max() + far:
         return None
