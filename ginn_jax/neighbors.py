@@ -74,7 +74,7 @@ def _search_apart(
     parts: Parts,
 ) -> tuple[Int[np.ndarray, "E"], Int[np.ndarray, "E"]]:
     """`find_neighbors` of either half by itself."""
-    pairs = [(np.zeros(0, np.int32), np.zeros(0, np.int32))]
+    pairs = []
     for asked, near in parts:
         query, point = find_neighbors(points[near], queries[asked], radius)
         rows = asked.astype(np.int32), near.astype(np.int32)

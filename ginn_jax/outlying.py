@@ -17,7 +17,6 @@ ASKED, SHARE = 1 << 10, 1 << 6
 # many radii: a grid has finer cells than that.
 FAR_OFF, WIDE = 8, 128
 
-
 Box = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
 
 
