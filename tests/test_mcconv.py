@@ -225,10 +225,10 @@ def test_a_splat_is_the_mean_of_what_is_near_and_faces_alike():
     [(4, 6, "takes 4 inputs, edges have 3"), (3, 9, "3 blocks of 4 values for 6")],
 )
 def test_a_kernel_made_for_something_else_is_refused(inputs, outputs, message):
-    zeros = np.zeros(8, np.int32)
-    field = rf.Field(zeros, zeros, np.zeros((3, 8), np.float32), np.ones(8), 8)
+    zeros = jnp.zeros(8, jnp.int32)
+    field = rf.Field(zeros, zeros, jnp.zeros((3, 8)), jnp.ones(8), jnp.int32(8))
     kernel = kernels.init_kernel(inputs, outputs, 4, 4, key=jax.random.key(0))
     with pytest.raises(InputError, match=message):
-        mc.mc_conv(kernel, np.zeros((5, 6), np.float32), field, 5)
+        mc.mc_conv(kernel, jnp.zeros((5, 6)), field, 5)
     with pytest.raises(InputError, match=message):
-        mc.mc_conv_mixing(kernel, np.zeros((5, 2), np.float32), field, 5, 3)
+        mc.mc_conv_mixing(kernel, jnp.zeros((5, 2)), field, 5, 3)
