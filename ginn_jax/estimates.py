@@ -62,7 +62,7 @@ def check_stratified(paths: int) -> None:
         raise InputError(f"{paths} paths have no strata: give {fewer} or {more}")
 
 
-def summarize(values: Any, paths: int, stratified: bool) -> ColorEstimate:
+def summarize(values: Any, paths: int, stratified: bool = False) -> ColorEstimate:
     """Mean of every `paths` successive values, and the variance of that mean, which is
     known of independent values only."""
     import drjit as dr
