@@ -20,7 +20,7 @@ from ginn_jax.candidates import (
 )
 from ginn_jax.checks import FAR, real_array, within_reach
 from ginn_jax.errors import InputError
-from ginn_jax.outlying import Parts, set_apart
+from ginn_jax.outlying import Parts, bounds_of, set_apart
 from ginn_jax.packets import Words, list_bits, packet_words
 from ginn_jax.pairs import Pairs, decide, in_order, join
 from ginn_jax.process import ALONE, available_cores
@@ -55,10 +55,11 @@ def find_neighbors(
     if not (len(points) and len(queries)):
         as_points("queries", queries)  # refused all the same
         return np.zeros(0, np.int32), np.zeros(0, np.int32)
-    parts = set_apart(points, queries, radius)
+    low, high = bounds_of(points)
+    parts = set_apart(points, (low, high), queries, radius)
     if parts is not None:
         return _search_apart(points, queries, radius, parts)
-    center = 0.5 * (points.min(0) + points.max(0))
+    center = 0.5 * (low + high)
     if len(points) > MANY:
         near = offsets_from(center, as_points("queries", queries))
         order = _along_curve(*pad_rows(near, bucket(len(near))))[: len(near)]

@@ -29,14 +29,18 @@ class Parts(NamedTuple):
 
 
 def set_apart(
-    points: Float[np.ndarray, "N 3"], queries: Shaped[np.ndarray, "M 3"], radius: float
+    points: Float[np.ndarray, "N 3"],
+    bounds: Box,
+    queries: Shaped[np.ndarray, "M 3"],
+    radius: float,
 ) -> Parts | None:
-    """Both halves of a search, or None where one box serves all.
+    """Both halves of a search, or None where one box serves all; `bounds` are those of
+    the points.
 
     Every pair closer than the radius is in one half, and none in both: each query is in
     one only.
     """
-    reach, bounds = 1.001 * radius, (points.min(axis=0), points.max(axis=0))
+    reach = 1.001 * radius
     box = box_of_most(points, bounds, radius)
     if box is None:
         box = _box_of_all(bounds, queries, reach)
@@ -69,11 +73,14 @@ def box_of_most(
     return middle - 1.5 * width, middle + 1.5 * width
 
 
+def bounds_of(points: Float[np.ndarray, "N 3"]) -> Box:
+    """The lowest and the highest corner of a box around some points."""
+    return points.min(axis=0), points.max(axis=0)
+
+
 def count_outlying(points: Float[np.ndarray, "N 3"]) -> int:
     """How many points lie far from all others."""
-    box = None
-    if len(points):
-        box = box_of_most(points, (points.min(axis=0), points.max(axis=0)), 0.0)
+    box = box_of_most(points, bounds_of(points), 0.0) if len(points) else None
     return 0 if box is None else int((~_within(points, *box)).sum())
 
 

@@ -21,7 +21,7 @@ def test_every_pair_is_in_one_half(points, queries, radius):
     points, queries = points.astype(np.float64), queries.astype(np.float64)
     if not (len(points) and len(queries)):
         return
-    parts = outlying.set_apart(points, queries, radius)
+    parts = outlying.set_apart(points, outlying.bounds_of(points), queries, radius)
     if parts is None:
         return
     found = []
@@ -46,7 +46,8 @@ def test_pairs_across_the_border_are_found(monkeypatch):
     chain = np.zeros((120, 3))
     chain[:60, 0] = chain[60:, 1] = 0.3 + 0.2 * np.arange(60)
     points = np.concatenate([crowd, chain])
-    assert outlying.set_apart(points, chain, 0.25) is not None
+    bounds = outlying.bounds_of(points)
+    assert outlying.set_apart(points, bounds, chain, 0.25) is not None
     pairs = np.stack(nb.find_neighbors(points, chain, 0.25), axis=1).tolist()
     assert sorted(map(tuple, pairs)) == neighbors(points, chain, 0.25)
 
